@@ -36,10 +36,12 @@ lint: setup ## Check style and formatting
 	$(BIN)/ruff format --check
 
 # What is shipped is checked, not the checkout: the folders at the root have other names once installed.
+# sed turns the installed paths back into those of the checkout.
 typecheck: setup ## Check the types of the installed package
 	@rm -rf build
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --target build/typecheck .
-	cd build/typecheck && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p nht
+	cd build/typecheck && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p nht \
+	    | sed -E 's#^nht/(transforms|envs|recipes|configs)/#\1/#'
 
 test test-slow: export OMP_NUM_THREADS := 1
 test test-slow: export WANDB_MODE := offline
