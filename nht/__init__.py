@@ -1,0 +1,24 @@
+"""Learned action interfaces: low-dimensional actions in, actuations of the motors out, depending on the context."""
+
+from nht.demos import Demos, load_demos, save_demos
+from nht.lipschitz import certificate
+from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
+from nht.storage import load_map, save_map
+from nht.train import MapTraining, projection_error, train_map
+
+__all__ = [
+    "NHT",
+    "SVD",
+    "ActionMap",
+    "Demos",
+    "Identity",
+    "LinearActionMap",
+    "MapTraining",
+    "certificate",
+    "load_demos",
+    "load_map",
+    "projection_error",
+    "save_demos",
+    "save_map",
+    "train_map",
+]
