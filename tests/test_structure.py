@@ -1,0 +1,133 @@
+"""The architecture, read from the syntax trees: which part may know which."""
+
+import ast
+import re
+import sys
+import tomllib
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-dir"]
+
+# Packages of ours that each package may import from.
+OURS = {
+    "nht": {"nht"},
+    "nht.transforms": {"nht", "nht.transforms"},
+    "nht.envs": {"nht.envs"},
+    "nht.recipes": set(FOLDERS),
+    "nht.configs": set(),
+}
+# Others' packages, beside the standard library. Recipes may use any.
+THEIRS = {
+    "nht": {"minari", "numpy", "safetensors", "tensordict", "torch", "torchrl.data"},
+    "nht.transforms": {"tensordict", "torch", "torchrl"},
+    "nht.envs": {"dm_control", "gymnasium", "mujoco", "numpy", "tensordict", "torch", "torchrl"},
+    "nht.configs": set(),
+}
+# Within nht, a module imports from lower layers only. Those not named here are members of the family of maps.
+LAYERS = {
+    "nht.geometry": 0,
+    "nht.demos": 0,
+    "nht.maps": 1,
+    "nht.lipschitz": 3,
+    "nht.storage": 4,
+    "nht.train": 4,
+    "nht": 5,
+}
+FAMILY_LAYER = 2
+
+
+def test_imports_point_one_way():
+    wrong = import_violations(shipped_trees())
+    assert not wrong, "\n".join(wrong)
+
+
+def test_imports_form_no_circle():
+    trees = shipped_trees()
+    graph = {name: imports_of(tree, set(trees)) & set(trees) for name, tree in trees.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"circular imports: {error.args[1]}")
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("nht.geometry", "from nht import maps"),
+        ("nht.maps", "def f():\n    import nht.lipschitz"),
+        ("nht.laser", "from nht.train import train_map"),
+        ("nht.train", "from nht import NHT"),
+        ("nht.train", "import torchrl.envs"),
+        ("nht.demos", "import hydra"),
+        ("nht.transforms.action_map", "from nht.envs import make_env"),
+        ("nht.transforms.action_map", "import transforms.other"),
+        ("nht.envs.wam", "import nht"),
+        ("nht.envs.wam", "from nht.transforms import ActionMapTransform"),
+    ],
+)
+def test_a_wrong_import_is_noticed(module, source):
+    modules = ["nht", "nht.geometry", "nht.maps", "nht.lipschitz", "nht.train", "nht.transforms", "nht.envs"]
+    trees = {name: ast.parse("") for name in modules} | {module: ast.parse(source)}
+    assert len(import_violations(trees)) == 1
+
+
+def test_files_are_named_after_what_they_hold():
+    names_nothing = re.compile(r"(^|_)(utils?|common|helpers?|misc)(\.py)?$")
+    folders = [*FOLDERS.values(), "tests", "benchmarks"]
+    files = [file.relative_to(ROOT) for folder in folders for file in (ROOT / folder).rglob("*.py")]
+    assert [file for file in files if any(map(names_nothing.search, file.parts))] == []
+
+
+def shipped_trees() -> dict[str, ast.Module]:
+    """Syntax tree of every module that is shipped, by the name it is imported as."""
+    trees = {}
+    for package, folder in FOLDERS.items():
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            names = [package, *file.relative_to(ROOT / folder).with_suffix("").parts]
+            trees[".".join(names).removesuffix(".__init__")] = ast.parse(file.read_text())
+    return trees
+
+
+def package_of(module: str) -> str:
+    return max((package for package in FOLDERS if is_within(module, package)), key=len)
+
+
+def is_within(module: str, package: str) -> bool:
+    return module == package or module.startswith(f"{package}.")
+
+
+def imports_of(tree: ast.AST, ours: set[str]) -> set[str]:
+    """Modules imported anywhere in the tree: nht.maps by `from nht import maps`. Lint bans relative ones."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            longer = {f"{node.module}.{alias.name}" for alias in node.names}
+            modules = longer if node.module == "torchrl" else longer & ours
+            found |= modules | ({node.module} if longer - modules else set())
+    return found
+
+
+def import_violations(trees: dict[str, ast.Module]) -> list[str]:
+    return [
+        f"{module} imports {imported}"
+        for module, tree in trees.items()
+        for imported in sorted(imports_of(tree, set(trees)))
+        if not may_import(module, imported)
+    ]
+
+
+def may_import(module: str, imported: str) -> bool:
+    package = package_of(module)
+    if is_within(imported, "nht"):
+        if package == package_of(imported) == "nht":
+            return LAYERS.get(imported, FAMILY_LAYER) < LAYERS.get(module, FAMILY_LAYER)
+        return package_of(imported) in OURS[package]
+    if package == "nht.recipes" or imported.split(".")[0] in sys.stdlib_module_names:
+        return True
+    return any(is_within(imported, allowed) for allowed in THEIRS[package])
