@@ -5,7 +5,7 @@ SHELL := bash
 
 BIN := .venv/bin
 INSTALLED := .venv/.installed
-PYTHON ?=
+PYTHON ?= python3.11 python3 python
 PIP_FLAGS ?=
 
 .PHONY: help setup lint typecheck test test-slow demo bench clean
@@ -22,12 +22,12 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(BIN)/python:
-	@for python in $(or $(PYTHON),python3.11 python3 python); do \
+	@for python in $(PYTHON); do \
 	    if $$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
 	        exec $$python -m venv .venv; \
 	    fi; \
 	done; \
-	echo 'No Python 3.11 with venv and ensurepip found among: $(or $(PYTHON),python3.11, python3, python).' \
+	echo 'No Python 3.11 with venv and ensurepip found among: $(PYTHON).' \
 	    'Install it (Debian: python3.11-venv) or say where it is: make setup PYTHON=/path/to/python3.11' >&2; \
 	exit 1
 
