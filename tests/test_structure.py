@@ -5,12 +5,15 @@ import re
 import sys
 import tomllib
 from graphlib import CycleError, TopologicalSorter
+from importlib.metadata import packages_distributions
+from itertools import chain
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-dir"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+FOLDERS = PYPROJECT["tool"]["setuptools"]["package-dir"]
 
 # Packages of ours that each package may import from.
 OURS = {
@@ -75,6 +78,20 @@ def test_a_wrong_import_is_noticed(module, source):
     assert len(import_violations(trees)) == 1
 
 
+def test_every_package_that_is_imported_is_declared():
+    extras = PYPROJECT["project"]["optional-dependencies"]
+    needed = [
+        *PYPROJECT["project"]["dependencies"],
+        *chain(*(extras[name] for name in extras if name != "dev")),
+    ]
+    declared = {normalised(re.match(r"[\w.-]+", requirement)[0]) for requirement in needed}
+    tops = {name.split(".")[0] for tree in shipped_trees().values() for name in imports_of(tree, set())}
+    providers = {
+        top: packages_distributions().get(top, [top]) for top in tops - sys.stdlib_module_names - {"nht"}
+    }
+    assert {top for top, names in providers.items() if not declared & set(map(normalised, names))} == set()
+
+
 def test_files_are_named_after_what_they_hold():
     names_nothing = re.compile(r"(^|_)(utils?|common|helpers?|misc)(\.py)?$")
     folders = [*FOLDERS.values(), "tests", "benchmarks"]
@@ -90,6 +107,10 @@ def shipped_trees() -> dict[str, ast.Module]:
             names = [package, *file.relative_to(ROOT / folder).with_suffix("").parts]
             trees[".".join(names).removesuffix(".__init__")] = ast.parse(file.read_text())
     return trees
+
+
+def normalised(distribution: str) -> str:
+    return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
 def package_of(module: str) -> str:
