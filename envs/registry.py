@@ -1,0 +1,78 @@
+"""The table of tasks by name, and how to make one."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import torch
+
+from nht.envs.experts import Expert, WipeExpert
+from nht.envs.mujoco_batch import BatchedMujocoEnv
+from nht.envs.task import BatchedTask
+from nht.envs.wam import WAMWipe
+
+TASKS: dict[str, type[BatchedTask]] = {"wam_wipe": WAMWipe}
+"""Every task by the name that recipes and ``make_env`` use."""
+
+EXPERTS: dict[str, type[Expert]] = {"wam_wipe": WipeExpert}
+"""The scripted demonstrator of every task that has one."""
+
+
+def make_task(name: str, **options: Any) -> BatchedTask:
+    """Build the copies of a task.
+
+    Args:
+        name: a key of ``TASKS``.
+        options: arguments of the task, e.g. ``num_envs=64, seed=0, start="random"``.
+
+    Raises:
+        ValueError: for an unknown name or option; the message lists those that exist.
+    """
+    if name not in TASKS:
+        raise ValueError(f"unknown environment {name!r}: choose from {sorted(TASKS)}.")
+    _check_options(TASKS[name], options, name)
+    return TASKS[name](**options)
+
+
+def make_env(
+    name: str,
+    num_envs: int = 1,
+    num_threads: int = 1,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    **options: Any,
+) -> BatchedMujocoEnv:
+    """A batch-native TorchRL environment of ``num_envs`` copies.
+
+    Args:
+        name: a key of ``TASKS``, e.g. ``"wam_wipe"``.
+        num_envs: number of copies N, the environment's batch size.
+        num_threads: native threads that share the copies.
+        seed: seed of every random draw of the task.
+        device: where the tensors go.
+        options: further arguments of the task, e.g. ``start="random"``.
+
+    Raises:
+        ValueError: for an unknown name or option; the message lists those that exist.
+    """
+    task = make_task(name, num_envs=num_envs, num_threads=num_threads, seed=seed, **options)
+    return BatchedMujocoEnv(task, device=device)
+
+
+def make_expert(name: str, **settings: Any) -> Expert:
+    """The scripted demonstrator of a task.
+
+    Raises:
+        ValueError: for a task without one, or an unknown setting.
+    """
+    if name not in EXPERTS:
+        raise ValueError(f"{name!r} has no scripted expert: {sorted(EXPERTS)} have one.")
+    _check_options(EXPERTS[name], settings, f"the expert of {name}")
+    return EXPERTS[name](**settings)
+
+
+def _check_options(factory: type, options: dict[str, Any], name: str) -> None:
+    known = list(inspect.signature(factory).parameters)
+    if unknown := sorted(set(options) - set(known)):
+        raise ValueError(f"{name} has no option {unknown}: its options are {known}.")

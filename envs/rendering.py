@@ -1,0 +1,64 @@
+"""Offscreen pictures of one copy of a task, through MuJoCo's renderer."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+
+import mujoco
+import numpy as np
+from mujoco.rendering.classic import gl_context
+from numpy.typing import NDArray
+
+from nht.envs.task import BatchedTask
+
+
+class SceneRenderer:
+    """Renders a copy of a task with what the task adds to the scene (goal, marks).
+
+    Args:
+        task: the task to look at.
+        width: picture width [pixel].
+        height: picture height [pixel].
+        camera: name of a camera in the model.
+
+    Raises:
+        RuntimeError: if this machine has no OpenGL for offscreen rendering; the message says what to install.
+    """
+
+    def __init__(self, task: BatchedTask, width: int = 640, height: int = 480, camera: str | int = 0) -> None:
+        self.task = task
+        self.camera = camera
+        self._data = mujoco.MjData(task.model)
+        _prefer_offscreen_platform()
+        try:
+            self._renderer = mujoco.Renderer(task.model, height, width)
+        except Exception as error:
+            raise RuntimeError(
+                "offscreen rendering needs OpenGL: install EGL (Debian: libegl1 libgl1-mesa-dri), or OSMesa "
+                "(libosmesa6) and set MUJOCO_GL=osmesa before Python starts."
+            ) from error
+
+    def frame(self, row: int = 0) -> NDArray[np.uint8]:
+        """The copy ``row`` as it stands now, ``(height, width, 3)``."""
+        full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        mujoco.mj_setState(self.task.model, self._data, self.task.state[row], full_physics)
+        mujoco.mj_forward(self.task.model, self._data)
+        self._renderer.update_scene(self._data, camera=self.camera)
+        self.task.decorate(self._renderer.scene, row)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Release the OpenGL context."""
+        self._renderer.close()
+
+
+def _prefer_offscreen_platform() -> None:
+    """Let MuJoCo render through EGL where there is no display and nothing else was asked for.
+
+    MuJoCo chooses at its import, often before anyone could tell it (TorchRL imports it), so it has to choose again.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
+        os.environ["MUJOCO_GL"] = "egl"
+        importlib.reload(gl_context)

@@ -1,0 +1,90 @@
+"""Kinematics of the Barrett WAM for many postures at once.
+
+Frames follow the standard (Spong) Denavit-Hartenberg convention with the maker's constants; the world frame stands
+in the shoulder, 0.346 m above the base plate. ``assets/wam_arm.xml`` is the same chain for MuJoCo.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+A = np.array([0.0, 0.0, 0.045, -0.045, 0.0, 0.0, 0.0])
+"""DH link lengths [m]."""
+QUARTER_TURNS = np.array([-1, 1, -1, 1, -1, 1, 0])
+"""DH twists alpha in units of pi / 2."""
+D = np.array([0.0, 0.0, 0.55, 0.0, 0.3, 0.0, 0.18])
+"""DH link offsets [m]; the last one reaches to the tool face."""
+
+JOINT_LOW = np.array([-2.6, -2.0, -2.8, -0.9, -1.24, -1.6, -3.0])
+"""Lower joint limits [rad], the maker's; the wrist yaw is cut to +-1.24 as in the paper's tasks."""
+JOINT_HIGH = np.array([2.6, 2.0, 2.8, 3.1, 1.24, 1.6, 3.0])
+"""Upper joint limits [rad]."""
+MAX_SPEED = 2.0
+"""Largest speed of any joint [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the tool is and how the joints move it, for a batch of N postures."""
+
+    position: Array
+    """Centre of the tool face [m], ``(N, 3)``."""
+    normal: Array
+    """Unit vector out of the tool face, ``(N, 3)``."""
+    joint_axes: Array
+    """World direction of every joint axis, ``(N, 7, 3)``."""
+    joint_origins: Array
+    """A point on every joint axis [m], ``(N, 7, 3)``."""
+
+    def linear_jacobian(self) -> Array:
+        """Tool velocity [m/s] per joint velocity [rad/s], ``(N, 3, 7)``."""
+        lever = self.position[:, None] - self.joint_origins
+        return np.cross(self.joint_axes, lever).swapaxes(1, 2)
+
+    def angular_jacobian(self) -> Array:
+        """Angular velocity of the tool [rad/s] per joint velocity [rad/s], ``(N, 3, 7)``."""
+        return self.joint_axes.swapaxes(1, 2)
+
+    def normal_jacobian(self) -> Array:
+        """Rate of the face normal per joint velocity [rad/s], ``(N, 3, 7)``: each axis crossed with the normal."""
+        return np.cross(self.joint_axes, self.normal[:, None]).swapaxes(1, 2)
+
+
+def forward_kinematics(joint_angle: Array) -> Pose:
+    """Tool pose and joint axes at the joint angles ``(N, 7)`` [rad]."""
+    count = joint_angle.shape[0]
+    cos, sin = np.cos(joint_angle)[..., None], np.sin(joint_angle)[..., None]
+    x, y, z = (np.broadcast_to(axis, (count, 3)) for axis in np.eye(3))
+    position = np.zeros((count, 3))
+    axes, origins = np.empty((count, 7, 3)), np.empty((count, 7, 3))
+    for joint in range(7):
+        axes[:, joint], origins[:, joint] = z, position
+        turned = cos[:, joint] * x + sin[:, joint] * y
+        y = cos[:, joint] * y - sin[:, joint] * x
+        x = turned
+        position = position + D[joint] * z + A[joint] * x
+        if QUARTER_TURNS[joint]:
+            # A twist of +-pi/2 about x only swaps y and z, one of them negated.
+            sign = QUARTER_TURNS[joint]
+            y, z = sign * z, -sign * y
+    return Pose(position, np.ascontiguousarray(z), axes, origins)
+
+
+def damped_solve(jacobian: Array, velocity: Array, damping: float = 1e-3) -> Array:
+    """Joint velocity of least norm for a task velocity: J^T (J J^T + damping^2 I)^-1 velocity.
+
+    Args:
+        jacobian: ``(N, m, 7)``.
+        velocity: ``(N, m)``.
+        damping: keeps the joint velocity bounded near singular postures.
+
+    Returns:
+        ``(N, 7)``.
+    """
+    gram = jacobian @ jacobian.swapaxes(1, 2) + damping**2 * np.eye(jacobian.shape[1])
+    return (jacobian.swapaxes(1, 2) @ np.linalg.solve(gram, velocity[..., None]))[..., 0]
