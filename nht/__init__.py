@@ -1,4 +1,4 @@
-"""Learned action interfaces: low-dimensional actions in, actuations of the motors out, depending on the context."""
+"""Learned action interfaces: from low-dimensional actions, in a context, to the actuation of the motors."""
 
 from nht.demos import Demos, load_demos, save_demos
 from nht.lipschitz import certificate

@@ -1,96 +1,102 @@
 """Lipschitz constants of linear action maps: a limit kept in training, and a certificate afterwards.
 
-A layer x -> s(W x + b), where the slope of s is at most m, has the constant m |W|, |W| the spectral norm. Constants
-of a composition multiply; the step from the network's output to the basis adds `network_gain`, 2 sqrt(k) for NHT
-(Theorem 1 of the paper). The normaliser divides the context by its deviations: it is counted with the first layer.
+A layer s(W x + b) has the constant m |W|, with |W| the spectral norm of its matrix and m the largest slope of
+the activation. The constants of a composition multiply. From the network's output to the basis the map's
+`network_gain` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3). The normaliser, which divides
+the context by its deviations, is counted with the first layer, so that every statement is about the raw
+context.
 """
 
 import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap, NormKind
+from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap
 
-ROUNDING = 1e-6  # a limit is undercut by this share, lest rounding the scaled weights to float32 exceed it
+ROUNDING = 1e-6  # a limit is undercut by this share, lest rounding a scaled matrix to float32 exceed it
 
 
 @torch.no_grad()
 def certificate(map: ActionMap) -> float:
-    """A proven Lipschitz constant of the basis: |Q(c) - Q(c')| <= certificate * |c - c'| for all raw contexts.
+    """A proven Lipschitz constant of the basis: |Q(c) - Q(c')| <= certificate |c - c'| for all raw contexts.
 
-    Spectral norms are exact, in float64. It holds for any weights, trained with a limit or not.
+    The matrix norm is the spectral one, computed exactly and in float64. It holds for any weights, whether
+    training kept to a limit or not.
 
     Returns:
-        0 for a basis that ignores the context; infinity for a map that has no basis (not linear in the action).
+        0 for a basis that ignores the context; infinity for a map that is not linear in the action.
     """
     if not isinstance(map, LinearActionMap):
         return math.inf
     if map.network is None:
         return 0.0
-    layers = range(len(map.network.layers))
-    return map.network_gain * math.prod(
-        _slope(map.network, i) * float(_norm(_weight(map.network, i), "spectral")) for i in layers
-    )
+    norms = [torch.linalg.matrix_norm(matrix.double(), ord=2) for matrix in _matrices(map.network)]
+    return map.network_gain * math.prod(_slopes(map.network)) * math.prod(float(norm) for norm in norms)
 
 
 class LipschitzProjection:
-    """Keeps a map within its `lipschitz` limit by scaling layers down, as Gouk et al. (2018) do.
+    """Keeps a map within its `lipschitz` limit by scaling down its layers (Gouk et al., 2018).
 
-    Each layer may have the constant (L / network_gain)^(1 / layers), so that the whole has L. Exact spectral norms
-    are too dear for every step: `step` follows them by one round of power iteration, warm-started and therefore close
-    but, for a moment, possibly a little low; `exact` leaves nothing to chance. With "frobenius" both are exact.
+    Each layer may have the constant (lipschitz / network_gain)^(1 / layers), so that the whole has
+    `lipschitz`. The exact spectral norm is too dear for every step: `step` follows it by power iteration, one
+    round a step from where the last one ended, which can be a little low; `exact` leaves no doubt, and is
+    called before weights are kept. The Frobenius norm, never smaller than the spectral one, is exact in both.
+
+    Raises:
+        ValueError: if the map has no network or no limit.
     """
 
     def __init__(self, map: LinearActionMap) -> None:
         if map.network is None or map.lipschitz is None:
             raise ValueError(
-                f"{type(map).__name__} has no network or no limit to keep: lipschitz={map.lipschitz}"
+                f"{type(map).__name__} has no network to limit, or no limit: lipschitz={map.lipschitz}"
             )
         self.network = map.network
-        self.kind: NormKind = map.lipschitz_norm
-        per_layer = (map.lipschitz / map.network_gain) ** (1 / len(self.network.layers))
-        self.limits = [per_layer / _slope(self.network, i) for i in range(len(self.network.layers))]
-        self.directions: list[Tensor] = []
+        self.frobenius = map.lipschitz_norm == "frobenius"
+        slopes = _slopes(self.network)
+        per_layer = (map.lipschitz / map.network_gain) ** (1 / len(slopes)) * (1 - ROUNDING)
+        self.limits = [per_layer / slope for slope in slopes]
+        self.directions: list[Tensor] = []  # of each matrix, close to its leading right singular vector
         self.exact()
 
     @torch.no_grad()
     def step(self) -> None:
         """After an optimiser step."""
-        for i, limit in enumerate(self.limits):
-            weight = _weight(self.network, i)
-            if self.kind == "spectral":
-                left = weight @ self.directions[i]
-                self.directions[i] = nn.functional.normalize(weight.mT @ left, dim=0)
-                norm = torch.linalg.vector_norm(weight @ self.directions[i])
+        for i, matrix in enumerate(_matrices(self.network)):
+            if self.frobenius:
+                norm = torch.linalg.matrix_norm(matrix)
             else:
-                norm = _norm(weight, self.kind)
-            self._scale(i, norm, limit)
+                self.directions[i] = functional.normalize(matrix.mT @ (matrix @ self.directions[i]), dim=0)
+                norm = torch.linalg.vector_norm(matrix @ self.directions[i])
+            self._scale(i, norm)
 
     @torch.no_grad()
     def exact(self) -> None:
         """Before weights are kept: afterwards `certificate(map) <= map.lipschitz`."""
         self.directions = []
-        for i, limit in enumerate(self.limits):
-            weight = _weight(self.network, i).double()
-            self._scale(i, _norm(weight, self.kind), limit)
-            leading = torch.linalg.svd(weight, full_matrices=False).Vh[0]
-            self.directions.append(leading.to(self.network.layers[i].weight.dtype))
+        for i, matrix in enumerate(_matrices(self.network)):
+            _, singular, right = torch.linalg.svd(matrix.double(), full_matrices=False)
+            self.directions.append(right[0].to(matrix.dtype))
+            self._scale(i, torch.linalg.vector_norm(singular) if self.frobenius else singular[0])
 
-    def _scale(self, index: int, norm: Tensor, limit: float) -> None:
-        self.network.layers[index].weight.mul_((limit * (1 - ROUNDING) / norm).clamp_max(1))
-
-
-def _weight(network: ContextNetwork, index: int) -> Tensor:
-    """A layer's matrix; the first one's as it acts on the raw context."""
-    weight = network.layers[index].weight
-    return weight / network.context_std if index == 0 else weight
+    def _scale(self, index: int, norm: Tensor) -> None:
+        _linear(self.network, index).weight.mul_((self.limits[index] / norm).clamp_max(1))
 
 
-def _slope(network: ContextNetwork, index: int) -> float:
-    """The largest slope of what follows a layer: nothing follows the last one."""
-    return 1.0 if index == len(network.layers) - 1 else ACTIVATION_SLOPES[network.activation]
+def _matrices(network: ContextNetwork) -> list[Tensor]:
+    """The layers' matrices, the first one as it acts on the raw context."""
+    weights = [_linear(network, i).weight for i in range(len(network.layers))]
+    return [weights[0] / network.context_std, *weights[1:]]
 
 
-def _norm(weight: Tensor, kind: NormKind) -> Tensor:
-    return torch.linalg.matrix_norm(weight.double(), ord=2 if kind == "spectral" else "fro")
+def _slopes(network: ContextNetwork) -> list[float]:
+    """The largest slope of what follows each layer; nothing follows the last."""
+    return [ACTIVATION_SLOPES[network.activation]] * (len(network.layers) - 1) + [1.0]
+
+
+def _linear(network: ContextNetwork, index: int) -> nn.Linear:
+    layer = network.layers[index]
+    assert isinstance(layer, nn.Linear)
+    return layer

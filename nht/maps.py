@@ -1,7 +1,9 @@
 """Action maps: from a low-dimensional action and a context to the actuation of the motors, and back."""
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, Literal, get_args
 
 import torch
@@ -13,22 +15,26 @@ from nht.geometry import householder_apply, householder_coordinates, householder
 Activation = Literal["relu", "sigmoid", "tanh"]
 NormKind = Literal["spectral", "frobenius"]
 
-ACTIVATION_SLOPES: dict[str, float] = {"relu": 1.0, "sigmoid": 0.25, "tanh": 1.0}  # their largest slopes
+ACTIVATION_SLOPES = {"relu": 1.0, "sigmoid": 0.25, "tanh": 1.0}  # the largest slope of each
+FLATTEST = 100  # a normalised context entry varies at least 1/100 as much as the one that varies most
 
 
 class ActionMap(nn.Module, ABC):
     """A fixed or learned map (action, context) -> actuation.
 
-    Shapes: action (*batch, k), actuation (*batch, n), context (*batch, context_dim). A map that needs no context takes
-    one all the same; its last dimension may be 0. A subclass whose constructor arguments are plain JSON values, and
-    are given back by `init_args`, can be trained, saved and loaded like the ones here.
+    Shapes: action (*batch, k), actuation (*batch, n), context (*batch, context_dim). A map that needs no
+    context takes one all the same; its last dimension may then be 0. A subclass that keeps its constructor's
+    arguments as attributes of the same names is trained, saved and loaded like those below.
 
     Attributes:
-        action_dim, actuation_dim, context_dim: k, n and the context's width.
-        context_keys: the keys whose entries, concatenated in this order, are the context. None until trained.
-        data_fingerprint: the demonstrations' fingerprint. None until trained.
-        action_scale: buffer, scalar; the largest |a_i| of the demonstrations projected through the map. 1 until trained.
-        actuation_low, actuation_high: buffers, (n,); range of the demonstrated actuations. Infinite until trained.
+        action_dim: k.
+        actuation_dim: n.
+        context_dim: width of the context.
+        context_keys: the entries that, side by side in this order, are the context. None until trained.
+        data_fingerprint: which demonstrations it was trained on. None until trained.
+        action_scale: buffer, scalar: the largest |a_i| of the projected demonstrations. 1 until trained.
+        actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
+        actuation_high: buffer, (n,): the largest ones. infinity until trained.
     """
 
     action_scale: Tensor
@@ -38,10 +44,7 @@ class ActionMap(nn.Module, ABC):
     def __init__(self, context_dim: int, actuation_dim: int, action_dim: int) -> None:
         super().__init__()
         if not 1 <= action_dim <= actuation_dim:
-            raise ValueError(
-                f"action_dim must be between 1 and actuation_dim, got action_dim={action_dim}, "
-                f"actuation_dim={actuation_dim}"
-            )
+            raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}")
         if context_dim < 0:
             raise ValueError(f"context_dim must be 0 or more, got {context_dim}")
         self.context_dim = context_dim
@@ -61,12 +64,8 @@ class ActionMap(nn.Module, ABC):
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
         """The action, (*batch, k), that stands for an actuation."""
 
-    @abstractmethod
-    def init_args(self) -> dict[str, Any]:
-        """The constructor's arguments, as JSON values: `type(self)(**self.init_args())` is an untrained twin."""
-
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """What training minimises: the mean over the batch of |u - u_hat|^2, u_hat being u projected and mapped back.
+        """What training minimises: the mean of |u - u_hat|^2, u_hat being u projected and mapped back.
 
         Args:
             batch: "context" (batch, context_dim) and "actuation" (batch, n).
@@ -75,26 +74,29 @@ class ActionMap(nn.Module, ABC):
         return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Prepares the map from all training data, before the first gradient step.
+        """Prepares the map from all training data, before any gradient step.
 
         Returns:
-            True if this was all the training it takes (a closed-form fit); False if gradient steps must follow.
+            True if that was all the training it takes: a closed form.
         """
         return False
 
+    def init_args(self) -> dict[str, Any]:
+        """The constructor's arguments, to be JSON values: they make an untrained twin."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
 
 class LinearActionMap(ActionMap):
-    """u = Q(c) a: linear in the action.
+    """An action map that is linear in the action: u = Q(c) a.
 
     Attributes:
-        network: what turns the context into a description of the basis; None if the basis does not depend on it.
-        network_gain: a Lipschitz constant, in the spectral norm, of the step from the network's output to the basis.
+        network: what turns the context into a description of the basis; None if the basis is always the same.
+        network_gain: a Lipschitz constant, in the spectral norm, from the network's output to the basis.
         lipschitz: the Lipschitz constant of Q(c) that training keeps to; None for no limit.
-        lipschitz_norm: the matrix norm that training limits. "frobenius" is never smaller, hence stricter.
+        lipschitz_norm: the norm of the layers' matrices that is limited to this end.
     """
 
     network: "ContextNetwork | None"
-    network_gain: float
 
     def __init__(
         self,
@@ -118,6 +120,7 @@ class LinearActionMap(ActionMap):
         """Q(c): (*batch, context_dim) -> (*batch, n, k)."""
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
+        """Q(c) a."""
         return (self.basis(context) @ action.unsqueeze(-1)).squeeze(-1)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
@@ -126,11 +129,14 @@ class LinearActionMap(ActionMap):
 
 
 class ContextNetwork(nn.Module):
-    """A multilayer perceptron on the context, which it first normalises: (c - mean) / std.
+    """A multilayer perceptron on the context, which it normalises first: (c - mean) / std.
 
     Args:
+        context_dim: width of the context.
+        output_dim: width of the output.
         hidden: widths of the hidden layers; empty for a single linear layer.
-        seed: of the initial weights. The global random state is neither read nor changed.
+        activation: after each hidden layer.
+        seed: of the initial weights. The global random state is neither used nor changed.
     """
 
     context_mean: Tensor
@@ -141,56 +147,56 @@ class ContextNetwork(nn.Module):
     ) -> None:
         super().__init__()
         _check_choice("activation", activation, get_args(Activation))
-        if any(width < 1 for width in hidden):
-            raise ValueError(f"every width in hidden must be at least 1, got {list(hidden)}")
-        if context_dim < 1:
-            raise ValueError(f"a network needs a context_dim of at least 1, got {context_dim}")
+        if context_dim < 1 or any(width < 1 for width in hidden):
+            raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}")
         self.activation = activation
-        widths = [context_dim, *hidden, output_dim]
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
-            self.layers = nn.ModuleList(
-                nn.Linear(*pair) for pair in zip(widths[:-1], widths[1:], strict=True)
-            )
+            widths = (context_dim, *hidden, output_dim)
+            self.layers = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
         self.register_buffer("context_mean", torch.zeros(context_dim))
         self.register_buffer("context_std", torch.ones(context_dim))
 
     def forward(self, context: Tensor) -> Tensor:
+        """Maps (*batch, context_dim) to (*batch, output_dim)."""
         value = (context - self.context_mean) / self.context_std
         for layer in self.layers[:-1]:
             value = getattr(torch, self.activation)(layer(value))
         return self.layers[-1](value)
 
     @torch.no_grad()
-    def normalise_from(self, context: Tensor) -> None:
-        """Takes mean and standard deviation from contexts (T, context_dim).
+    def normalise(self, context: Tensor) -> None:
+        """Takes mean and deviation from contexts (T, context_dim).
 
-        An entry that varies by less than a hundredth of the most varied one is left at the scale of the latter's
-        hundredth: what hardly moves in the demonstrations must not become the loudest input once it moves more.
+        Deviations much smaller than the largest are raised: what hardly moves in the demonstrations, a height
+        over a table for example, would become the loudest input as soon as it moves more.
         """
         std = context.std(0, correction=0)
-        widest = std.max()
+        floor = std.max() / FLATTEST
         self.context_mean.copy_(context.mean(0))
-        self.context_std.copy_(std.clamp_min(widest / 100) if widest > 0 else torch.ones_like(std))
+        self.context_std.copy_(std.clamp_min(floor) if floor > 0 else torch.ones_like(std))
 
 
 class NHT(LinearActionMap):
-    """Neural Householder Transform (Eq. 13): orthonormal bases that vary smoothly with the context.
+    """Neural Householder Transform (Eq. 13): orthonormal bases that change smoothly with the context.
 
-    A network gives k tangent vectors, the exponential map makes unit vectors of them, whose k reflections, applied to
-    the padded action, are Q(c) a.
+    A network gives k tangent vectors, the exponential map makes them unit vectors, and the reflections at
+    these, applied to the padded action, give Q(c) a.
 
     Args:
-        context_dim, actuation_dim, action_dim: context width, n and k.
+        context_dim: width of the context.
+        actuation_dim: n, at least 2.
+        action_dim: k, in 1 ... n.
         hidden: widths of the hidden layers.
         activation: "relu", "sigmoid" or "tanh".
-        normalise: scale the contexts to mean 0 and deviation 1, as measured on the training data.
-        lipschitz: Lipschitz constant of Q(c), in the spectral norm and the raw context, that training keeps to.
-        lipschitz_norm: the norm of the layers that it limits; the authors' code took "frobenius".
+        normalise: scale the entries of the context by their mean and deviation in the training data.
+        lipschitz: Lipschitz constant of Q(c) that training keeps to, in the spectral norm and the raw
+            context.
+        lipschitz_norm: "spectral", or the stricter "frobenius", which the authors' code limits.
         seed: of the initial weights.
 
     Raises:
-        ValueError: on k outside 1 ... n, n < 2, or a value that is not among those named above.
+        ValueError: on an argument out of its range.
     """
 
     network: ContextNetwork
@@ -211,22 +217,12 @@ class NHT(LinearActionMap):
         super().__init__(context_dim, actuation_dim, action_dim, lipschitz, lipschitz_norm)
         if actuation_dim < 2:
             raise ValueError(f"NHT needs an actuation_dim of at least 2, got {actuation_dim}")
-        self.hidden, self.activation, self.normalise, self.seed = tuple(hidden), activation, normalise, seed
+        self.hidden = tuple(hidden)
+        self.activation = activation
+        self.normalise = normalise
+        self.seed = seed
         self.network = ContextNetwork(context_dim, action_dim * (actuation_dim - 1), hidden, activation, seed)
-        self.network_gain = 2 * action_dim**0.5  # Theorem 1; the exponential map's own constant is 1
-
-    def init_args(self) -> dict[str, Any]:
-        return {
-            "context_dim": self.context_dim,
-            "actuation_dim": self.actuation_dim,
-            "action_dim": self.action_dim,
-            "hidden": list(self.hidden),
-            "activation": self.activation,
-            "normalise": self.normalise,
-            "lipschitz": self.lipschitz,
-            "lipschitz_norm": self.lipschitz_norm,
-            "seed": self.seed,
-        }
+        self.network_gain = 2 * action_dim**0.5  # Theorem 1; the exponential map has the constant 1
 
     def reflectors(self, context: Tensor) -> Tensor:
         """The unit vectors v_1 ... v_k (Eq. 12): (*batch, context_dim) -> (*batch, k, n)."""
@@ -234,30 +230,33 @@ class NHT(LinearActionMap):
         return sphere_exp(tangents)
 
     def basis(self, context: Tensor) -> Tensor:
+        """Q(c), with orthonormal columns. `forward` and `project` do without it."""
         return householder_frame(self.reflectors(context))
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
+        """Q(c) a, by k reflections of the padded action."""
         return householder_apply(self.reflectors(context), action)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """Q^T u, which for orthonormal columns is the least-squares action."""
+        """Q(c)^T u, which is least squares for orthonormal columns."""
         return householder_coordinates(self.reflectors(context), actuation)[..., : self.action_dim]
 
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """The mean of |u - Q Q^T u|^2 (Eq. 6), read off the last n - k coordinates of u in the frame Q."""
+        """The mean of |u - Q Q^T u|^2 (Eq. 6), read off the last n - k coordinates of u."""
         coordinates = householder_coordinates(self.reflectors(batch["context"]), batch["actuation"])
         return coordinates[..., self.action_dim :].square().sum(-1).mean()
 
     def fit(self, batch: TensorDictBase) -> bool:
+        """Sets the normaliser; the weights are left to gradient steps."""
         if self.normalise:
-            self.network.normalise_from(batch["context"])
+            self.network.normalise(batch["context"])
         return False
 
 
 class SVD(LinearActionMap):
     """One basis for all contexts: the k leading right singular vectors of the demonstrated actuations.
 
-    The actuations are not centred, for a = 0 must stay u = 0. Until trained, the first k axes.
+    They are not centred before, because a = 0 must stay u = 0. Until trained, the basis is the first k axes.
     """
 
     frame: Tensor
@@ -266,29 +265,24 @@ class SVD(LinearActionMap):
         super().__init__(context_dim, actuation_dim, action_dim)
         self.register_buffer("frame", torch.eye(actuation_dim, action_dim))
 
-    def init_args(self) -> dict[str, Any]:
-        return {
-            "actuation_dim": self.actuation_dim,
-            "action_dim": self.action_dim,
-            "context_dim": self.context_dim,
-        }
-
     def basis(self, context: Tensor) -> Tensor:
+        """The same for every context."""
         return self.frame.expand(*context.shape[:-1], -1, -1)
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
+        """Q a."""
         return action @ self.frame.mT
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """Q^T u, which is least squares for orthonormal columns."""
         return actuation @ self.frame
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        _, _, rows = torch.linalg.svd(batch["actuation"].double(), full_matrices=False)
-        frame = rows[: self.action_dim].mT
-        # A singular vector's sign is arbitrary: make its largest entry positive, so that machines agree.
-        largest = frame.gather(0, frame.abs().argmax(0, keepdim=True))
-        self.frame.copy_(frame * largest.sign())
+        """The singular vectors, each with its largest entry positive, as their signs are arbitrary."""
+        rows = torch.linalg.svd(batch["actuation"].double(), full_matrices=False).Vh[: self.action_dim]
+        largest = rows.gather(1, rows.abs().argmax(1, keepdim=True))
+        self.frame.copy_((rows * largest.sign()).mT)
         return True
 
 
@@ -298,20 +292,21 @@ class Identity(LinearActionMap):
     def __init__(self, actuation_dim: int, context_dim: int = 0) -> None:
         super().__init__(context_dim, actuation_dim, actuation_dim)
 
-    def init_args(self) -> dict[str, Any]:
-        return {"actuation_dim": self.actuation_dim, "context_dim": self.context_dim}
-
     def basis(self, context: Tensor) -> Tensor:
+        """The identity matrix."""
         identity = torch.eye(self.actuation_dim, dtype=context.dtype, device=context.device)
         return identity.expand(*context.shape[:-1], -1, -1)
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
+        """The action itself."""
         return action
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """The actuation itself."""
         return actuation
 
     def fit(self, batch: TensorDictBase) -> bool:
+        """There is nothing to learn."""
         return True
 
 

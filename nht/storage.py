@@ -1,10 +1,12 @@
-"""A map in one file: a safetensors file with the weights and, as JSON in its header, all it takes to rebuild the map.
+"""A map in one safetensors file: the weights and, as JSON in the header, what it takes to rebuild the map.
 
 Loading checks every part and never unpickles. The header can be read without this package:
-`safetensors.safe_open(path, "pt").metadata()["map"]`.
+`json.loads(safetensors.safe_open(path, "pt").metadata()["map"])`.
 """
 
+import inspect
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -25,56 +27,44 @@ FORMAT_VERSION = 1
 
 
 def save_map(map: ActionMap, path: str | Path) -> Path:
-    """Writes a map to one file, in one go: a reader sees the old file or the new one, never half of it.
+    """Writes a map to one file; a reader sees the old file or the whole new one, never a part.
 
-    Besides the weights (normaliser and bounds are among them, as buffers) it holds class and constructor arguments,
-    context keys in order, n and k, the bounds and the certificate as plain numbers, and the data's fingerprint.
+    Normaliser and bounds are buffers and therefore among the weights. The header has class, constructor
+    arguments and the context's keys in order; and for whoever reads only the header k, n, bounds,
+    certificate, the fingerprint of the data and the version.
+
+    Returns:
+        The path.
     """
     path = Path(path)
-    keys = map.context_keys
-    description = {
-        "class": type(map).__name__,
-        "init_args": map.init_args(),
-        "context_keys": None
-        if keys is None
-        else [key if isinstance(key, str) else list(key) for key in keys],
-        "context_dim": map.context_dim,
-        "actuation_dim": map.actuation_dim,
-        "action_dim": map.action_dim,
-        "action_scale": float(map.action_scale),
-        "actuation_low": map.actuation_low.tolist(),
-        "actuation_high": map.actuation_high.tolist(),
-        "lipschitz_certificate": certificate(map),
-        "data_fingerprint": map.data_fingerprint,
-        "nht_version": version("nht"),
-    }
-    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": json.dumps(description)}
+    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": json.dumps(_description(map))}
     tensors = {name: value.detach().cpu().contiguous() for name, value in map.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as scratch:
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
         save_file(tensors, Path(scratch) / path.name, header)
         os.replace(Path(scratch) / path.name, path)
     return path
 
 
 def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
-    """Reads a map back, ready to use: in eval mode, its parameters without gradients.
+    """Reads a map, ready to use: in eval mode, its parameters without gradients.
 
-    A map of a class of your own loads once that subclass of `ActionMap` has been imported.
+    A class of your own is found once its module is imported.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is truncated, not a map, of a newer format, of an unknown class, or its weights do not fit.
+        ValueError: if the file is cut short, no map, of another format version or of an unknown class, or if
+            its weights do not fit the class.
     """
-    header, tensors = _read(Path(path))
+    path = Path(path)
+    header, tensors = _read(path)
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path} is not an action map: its header is not marked {FORMAT!r}")
-    if header.get("format_version") != str(FORMAT_VERSION):
-        raise ValueError(
-            f"{path} has format version {header.get('format_version')}, this version of nht reads {FORMAT_VERSION}"
-        )
+        raise ValueError(f"{path} holds no action map: its header is not marked {FORMAT!r}")
+    found = header.get("format_version")
+    if found != str(FORMAT_VERSION):
+        raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}")
     description = json.loads(header["map"])
-    map = _build(description, path)
+    map = _untrained(description, path)
     _fill(map, tensors, path)
     keys = description["context_keys"]
     map.context_keys = (
@@ -84,24 +74,46 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
     return map.to(device).eval().requires_grad_(False)
 
 
+def _description(map: ActionMap) -> dict[str, Any]:
+    return {
+        "class": type(map).__name__,
+        "init_args": map.init_args(),
+        "context_keys": map.context_keys,
+        "data_fingerprint": map.data_fingerprint,
+        "context_dim": map.context_dim,
+        "actuation_dim": map.actuation_dim,
+        "action_dim": map.action_dim,
+        "action_scale": float(map.action_scale),
+        "actuation_low": [_finite(value) for value in map.actuation_low.tolist()],
+        "actuation_high": [_finite(value) for value in map.actuation_high.tolist()],
+        "lipschitz_certificate": _finite(certificate(map)),
+        "nht_version": version("nht"),
+    }
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if math.isfinite(value) else None
+
+
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no map file {path}")
     try:
         with safe_open(path, framework="pt") as file:
-            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise ValueError(f"{path} is not a safetensors file, or is cut short: {error}") from error
+        raise ValueError(f"{path} is no safetensors file, or is cut short: {error}") from error
 
 
-def _build(description: dict[str, Any], path: str | Path) -> ActionMap:
-    """The untrained twin of the saved map."""
+def _untrained(description: dict[str, Any], path: Path) -> ActionMap:
+    """The saved map's twin, before training."""
     name = description["class"]
-    known = {candidate.__name__: candidate for candidate in _subclasses(ActionMap)}
+    known = {kind.__name__: kind for kind in _subclasses(ActionMap) if not inspect.isabstract(kind)}
     if name not in known:
         raise ValueError(
             f"{path} holds a map of the unknown class {name!r}; known are {', '.join(sorted(known))}. "
-            "Import the module of a class of your own before loading."
+            "Import a class of your own before loading its map"
         )
     try:
         return known[name](**description["init_args"])
@@ -109,26 +121,28 @@ def _build(description: dict[str, Any], path: str | Path) -> ActionMap:
         raise ValueError(f"{path} holds arguments that {name} does not take: {error}") from error
 
 
-def _subclasses(parent: type[ActionMap]) -> Iterator[type[ActionMap]]:
+def _subclasses(parent: type) -> Iterator[type]:
+    child: type
     for child in parent.__subclasses__():
-        if not child.__abstractmethods__:
-            yield child
+        yield child
         yield from _subclasses(child)
 
 
-def _fill(map: ActionMap, tensors: dict[str, Tensor], path: str | Path) -> None:
-    """Loads the weights, all of them and nothing else, in the precision they were saved in."""
-    expected = map.state_dict()
-    missing, unexpected = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
-    if missing or unexpected:
-        raise ValueError(f"the weights in {path} do not fit {type(map).__name__}: {missing=}, {unexpected=}")
+def _fill(map: ActionMap, tensors: dict[str, Tensor], path: Path) -> None:
+    """Loads the weights, all of them and no others, in the precision they were saved in."""
+    untrained = map.state_dict()
+    if untrained.keys() != tensors.keys():
+        raise ValueError(
+            f"the weights in {path} do not fit {type(map).__name__}: "
+            f"missing {sorted(untrained.keys() - tensors.keys())}, "
+            f"unexpected {sorted(tensors.keys() - untrained.keys())}"
+        )
     precision = tensors["action_scale"].dtype
-    for name, value in expected.items():
-        found = tensors[name]
-        wanted = precision if value.is_floating_point() else value.dtype
-        if found.shape != value.shape or found.dtype != wanted:
+    for name, value in untrained.items():
+        dtype = precision if value.is_floating_point() else value.dtype
+        if tensors[name].shape != value.shape or tensors[name].dtype != dtype:
             raise ValueError(
-                f"the weights in {path} do not fit {type(map).__name__}: {name} is {found.dtype} "
-                f"{tuple(found.shape)}, expected {wanted} {tuple(value.shape)}"
+                f"the weights in {path} do not fit {type(map).__name__}: {name} is {tensors[name].dtype} "
+                f"{tuple(tensors[name].shape)}, expected {dtype} {tuple(value.shape)}"
             )
     map.to(precision).load_state_dict(tensors)

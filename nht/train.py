@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -14,17 +14,19 @@ from nht.lipschitz import LipschitzProjection, certificate
 from nht.maps import ActionMap, LinearActionMap
 
 EVALUATE_EVERY = 250  # gradient steps
-RANK_TOLERANCE = 1e-5  # singular values below this share of the largest count as rounding
-CHUNK = 65_536  # transitions projected at once when measuring an error
+RANK_TOLERANCE = 1e-5  # actuations' singular values below this share of the largest one are rounding
+CHUNK = 65_536  # transitions projected at once when measuring
+
+Progress = Callable[[dict[str, float]], None]
 
 
 class MapTraining(NamedTuple):
-    """A trained map and what its training came to.
+    """What training gave.
 
     Attributes:
-        map: the map that was handed in, trained in place.
-        metrics: "validation_error" and "training_error" (relative projection errors on the held-out and the other
-            episodes), "steps", "best_step", "seconds", "certificate", "action_scale", "transitions",
+        map: the map that was handed in, trained, in eval mode.
+        metrics: relative projection errors "validation_error" (on the held-out episodes) and "training_error"
+            (on the others); "steps", "best_step", "seconds"; "certificate", "action_scale"; "transitions",
             "training_episodes", "validation_episodes".
     """
 
@@ -39,44 +41,49 @@ def train_map(
     context_keys: Sequence[NestedKey] | None = None,
     batch_size: int = 256,
     learning_rate: float = 1e-3,
-    max_steps: int = 20_000,
+    max_steps: int = 10_000,
     patience: int = 4_000,
     validation_share: float = 0.1,
     seed: int = 0,
-    progress: Callable[[dict[str, float]], None] | None = None,
+    progress: Progress | None = None,
 ) -> MapTraining:
-    """Trains a map in place, on the device it is on, and keeps the weights that were best on held-out episodes.
+    """Trains a map in place, on its own device, and keeps the weights that were best on held-out episodes.
 
-    Adam on `map.loss`, unless `map.fit` says that a closed form was enough. The learning rate falls by a cosine over
-    `max_steps`; training ends early when the validation error has not fallen for `patience` steps. Sets the map's
-    context keys, action scale, bounds and fingerprint.
+    If `map.fit` is no closed form, Adam follows `map.loss`, with a learning rate that falls to 0 along a
+    cosine. The map also learns its context keys, action scale, bounds and the fingerprint of the data.
 
     Args:
-        context_keys: the context, in order; default `map.context_keys`, else "context" if the demonstrations have it.
-        validation_share: of the episodes, held out; at least one.
-        seed: of the split and of the batches. The initial weights have a seed of their own, in the map.
+        demos: the demonstrations.
+        map: any action map.
+        context_keys: the entries that make up the context, in order. Default: the map's own, or "context".
+        batch_size: transitions per gradient step.
+        learning_rate: of Adam, at the start.
+        max_steps: of gradient descent, at most.
+        patience: steps without a better validation error after which training ends.
+        validation_share: of the episodes, held out; at least one episode.
+        seed: of the split and of the batches. The initial weights have their own, an argument of the map.
         progress: called at every evaluation with "step", "loss", "validation_error" and "seconds".
 
     Raises:
         KeyError: on a context key that the demonstrations lack.
-        ValueError: on demonstrations that do not fit the map, have fewer than k independent actuations or fewer than
-            two episodes, and on a share or a number out of range.
+        ValueError: on demonstrations that do not fit the map, or have fewer than k independent actuations or
+            two episodes; on a number out of range. FloatingPointError: if the loss diverged from the start.
     """
     _check_numbers(batch_size, learning_rate, max_steps, patience, validation_share)
     start = time.perf_counter()
     keys = _context_keys(demos, map, context_keys)
     data = _training_data(demos, map, keys)
-    held_out = split_episodes(demos.episode, validation_share, seed).to(data.device)
+    held_out = split_episodes(demos.episode, validation_share, seed)
     training, validation = data[~held_out], data[held_out]
 
-    steps = best_step = 0
     map.train()
+    steps = best_step = 0
     if not map.fit(training):
-        steps, best_step = _descend(
-            map, training, validation, batch_size, learning_rate, max_steps, patience, seed, progress
-        )
+        rounds = _gradient_steps(map, training, batch_size, learning_rate, max_steps, seed)
+        steps, best_step = _keep_best(map, validation, rounds, patience, progress)
     map.eval()
-    _describe(map, data, keys, demos.fingerprint)
+    map.context_keys, map.data_fingerprint = keys, demos.fingerprint
+    _set_bounds(map, data)
     return MapTraining(
         map,
         {
@@ -88,103 +95,91 @@ def train_map(
             "certificate": certificate(map),
             "action_scale": float(map.action_scale),
             "transitions": len(data),
-            "training_episodes": len(demos.episode[~held_out.cpu()].unique()),
-            "validation_episodes": len(demos.episode[held_out.cpu()].unique()),
+            "training_episodes": len(torch.unique(demos.episode[~held_out])),
+            "validation_episodes": len(torch.unique(demos.episode[held_out])),
         },
     )
 
 
 @torch.no_grad()
 def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> float:
-    """Relative projection error sum |u - u_hat|^2 / sum |u|^2, u_hat being u projected and mapped back.
+    """Relative projection error, sum |u - u_hat|^2 / sum |u|^2, u_hat being u projected and mapped back.
 
     Args:
-        context: (T, context_dim); of demonstrations, `demos.context(map.context_keys)`.
-        actuation: (T, n), in the map's own precision.
+        map: any action map.
+        context: (T, context_dim); of demonstrations `demos.context(map.context_keys)`.
+        actuation: (T, n).
     """
     missed = total = 0.0
-    for c, u in zip(context.split(CHUNK), actuation.split(CHUNK), strict=True):
+    for c, u in zip(torch.split(context, CHUNK), torch.split(actuation, CHUNK), strict=True):
         missed += float((u - map(map.project(u, c), c)).double().square().sum())
         total += float(u.double().square().sum())
+    if total == 0:
+        raise ValueError("the projection error is relative to the actuations, and these are all zero")
     return missed / total
 
 
 def split_episodes(episode: Tensor, share: float, seed: int) -> Tensor:
-    """Holds out a share of the episodes, at least one and never all: (T,) -> (T,) bool, true where held out."""
-    names = episode.unique()
+    """Holds out a share of the episodes, at least one, never all: (T,) -> (T,) bool, true where held out."""
+    names = torch.unique(episode)
     if len(names) < 2:
-        raise ValueError(
-            f"at least 2 episodes are needed to hold one out, the demonstrations have {len(names)}"
-        )
+        raise ValueError(f"at least 2 episodes are needed, to hold one out, but there is {len(names)}")
     count = min(max(1, round(share * len(names))), len(names) - 1)
     order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))
     return torch.isin(episode, names[order[:count]])
 
 
-def _descend(
-    map: ActionMap,
-    training: TensorDictBase,
-    validation: TensorDictBase,
-    batch_size: int,
-    learning_rate: float,
-    max_steps: int,
-    patience: int,
-    seed: int,
-    progress: Callable[[dict[str, float]], None] | None,
-) -> tuple[int, int]:
-    """Gradient steps until the validation error stops falling; leaves the best weights in the map."""
-    start = time.perf_counter()
+def _gradient_steps(
+    map: ActionMap, data: TensorDictBase, batch_size: int, learning_rate: float, max_steps: int, seed: int
+) -> Iterator[tuple[int, float]]:
+    """Yields step and loss every EVALUATE_EVERY steps, when the map is exactly within its limit."""
     generator = torch.Generator().manual_seed(seed)
-    optimiser = torch.optim.Adam(map.parameters(), lr=learning_rate)
+    optimiser = torch.optim.Adam(map.parameters(), lr=learning_rate, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max_steps)
-    limited = isinstance(map, LinearActionMap) and map.lipschitz is not None
-    limit = LipschitzProjection(map) if limited else None
-    best_error, best_step, best_weights = float("inf"), 0, {}
+    limit = None
+    if isinstance(map, LinearActionMap) and map.lipschitz is not None:
+        limit = LipschitzProjection(map)
     for step in range(1, max_steps + 1):
-        rows = torch.randint(len(training), (batch_size,), generator=generator)
-        loss = map.loss(training[rows])
+        rows = torch.randint(len(data), (batch_size,), generator=generator)
+        loss = map.loss(data[rows])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
         if limit is not None:
             limit.step()
-        if step % EVALUATE_EVERY and step < max_steps:
-            continue
-        if limit is not None:
-            limit.exact()
+        if step % EVALUATE_EVERY == 0 or step == max_steps:
+            if limit is not None:
+                limit.exact()
+            yield step, loss.item()
+
+
+def _keep_best(
+    map: ActionMap,
+    validation: TensorDictBase,
+    rounds: Iterator[tuple[int, float]],
+    patience: int,
+    progress: Progress | None,
+) -> tuple[int, int]:
+    """Trains until the validation error stops falling: the steps made, and the step of the best weights."""
+    start = time.perf_counter()
+    best_error, best_step, step = float("inf"), 0, 0
+    best_weights = map.state_dict()
+    for step, loss in rounds:
         error = projection_error(map, validation["context"], validation["actuation"])
         if error < best_error:
             best_error, best_step, best_weights = error, step, copy.deepcopy(map.state_dict())
         if progress is not None:
             seconds = time.perf_counter() - start
-            progress({"step": step, "loss": float(loss), "validation_error": error, "seconds": seconds})
+            progress({"step": step, "loss": loss, "validation_error": error, "seconds": seconds})
         if step - best_step >= patience:
             break
+    if best_step == 0:
+        raise FloatingPointError(
+            f"training diverged: no finite validation error in {step} steps; lower learning_rate"
+        )
     map.load_state_dict(best_weights)
     return step, best_step
-
-
-def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> TensorDict:
-    """Context and actuation of all transitions, in memory, in the map's precision and on its device."""
-    context, actuation = demos.context(keys), demos.actuation
-    if actuation.shape[-1] != map.actuation_dim:
-        raise ValueError(
-            f"the demonstrated actuations have {actuation.shape[-1]} dimensions, the map {map.actuation_dim}"
-        )
-    if context.shape[-1] != map.context_dim:
-        widths = {key: demos.data[key].shape[-1] for key in keys}
-        raise ValueError(
-            f"the map takes a context of {map.context_dim} numbers, the keys {widths} give another"
-        )
-    singular = torch.linalg.svdvals(actuation.double())
-    rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
-    if rank < map.action_dim < map.actuation_dim:
-        raise ValueError(
-            f"the demonstrations have {rank} independent actuations, too few for action_dim={map.action_dim}"
-        )
-    entries = {"context": context, "actuation": actuation}
-    return TensorDict(entries, batch_size=len(actuation)).to(map.action_scale.device, map.action_scale.dtype)
 
 
 def _context_keys(
@@ -196,19 +191,39 @@ def _context_keys(
         return map.context_keys
     if map.context_dim == 0:
         return ()
-    if "context" in demos.data.keys():
+    if "context" in demos.data:
         return ("context",)
     raise ValueError(
-        f"name the context_keys of the map; the demonstrations have {', '.join(demos.manifest['keys'])}"
+        f"context_keys must name some of the demonstrations' keys: {', '.join(demos.manifest['keys'])}"
     )
 
 
+def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> TensorDict:
+    """Context and actuation of all transitions, in memory, in the map's precision and on its device."""
+    context, actuation = demos.context(keys), demos.actuation
+    if actuation.shape[-1] != map.actuation_dim:
+        raise ValueError(
+            f"demonstrated actuations have {actuation.shape[-1]} dimensions, the map's {map.actuation_dim}"
+        )
+    if context.shape[-1] != map.context_dim:
+        widths = ", ".join(f"{key!r}: {demos.data[key].shape[-1]}" for key in keys)
+        raise ValueError(
+            f"the map's context has width {map.context_dim}, the keys give {context.shape[-1]}: {widths}"
+        )
+    singular = torch.linalg.svdvals(actuation.double())
+    rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
+    if rank < map.action_dim < map.actuation_dim:
+        raise ValueError(
+            f"the demonstrations have {rank} independent actuations, too few for k = {map.action_dim}"
+        )
+    data = TensorDict({"context": context, "actuation": actuation}, batch_size=len(actuation))
+    return data.to(map.action_scale.device, map.action_scale.dtype)
+
+
 @torch.no_grad()
-def _describe(map: ActionMap, data: TensorDictBase, keys: tuple[NestedKey, ...], fingerprint: str) -> None:
-    """Writes into the map what its users need to know of the demonstrations."""
-    map.context_keys, map.data_fingerprint = keys, fingerprint
-    chunks = zip(data["actuation"].split(CHUNK), data["context"].split(CHUNK), strict=True)
-    map.action_scale.copy_(torch.stack([map.project(u, c).abs().max() for u, c in chunks]).max())
+def _set_bounds(map: ActionMap, data: TensorDictBase) -> None:
+    batches = zip(torch.split(data["actuation"], CHUNK), torch.split(data["context"], CHUNK), strict=True)
+    map.action_scale.copy_(torch.stack([map.project(u, c).abs().max() for u, c in batches]).max())
     map.actuation_low.copy_(data["actuation"].amin(0))
     map.actuation_high.copy_(data["actuation"].amax(0))
 
