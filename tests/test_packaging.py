@@ -104,14 +104,14 @@ def test_wheel_holds_types_models_and_configs(wheel):
 def test_every_module_imports_outside_the_checkout(installed):
     code = """
 import importlib, pkgutil, nht
-print(nht.__version__)
+print(getattr(nht, "__version__", None))
 for found in pkgutil.walk_packages(nht.__path__, "nht."):
     print(importlib.import_module(found.name).__file__)
 """
     version, *files = python(installed, code).split()
-    assert version == PROJECT["project"]["version"]
     assert len(files) == sum(file.suffix == ".py" for file in SOURCES) - 1  # without nht itself
     assert [file for file in files if not Path(file).is_relative_to(installed)] == []
+    assert version == PROJECT["project"]["version"]
 
 
 def test_recipes_find_their_configuration_outside_the_checkout(installed):
