@@ -1,0 +1,5 @@
+"""TorchRL transforms that put an action map between a policy and an environment."""
+
+from nht.transforms.action_map import ActionMapTransform, ContextSnapshot
+
+__all__ = ["ActionMapTransform", "ContextSnapshot"]
