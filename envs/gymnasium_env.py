@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from nht.envs.registry import TASKS, make_task
 from nht.envs.rendering import SceneRenderer
 
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
+
 
 class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One copy of a task. ``info`` holds the flags ``success``, ``failure`` and ``diverged``, and the raw keys.
@@ -25,7 +27,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         ValueError: for an unknown task, option or render mode.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata = METADATA
     spec: EnvSpec | None
 
     def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
@@ -66,7 +68,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         values = {key: value[0].astype(np.float32) for key, value in self.task.observe().items()}
         return values.pop("observation"), values
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The scene as ``(height, width, 3)`` in ``rgb_array`` mode."""
         if self.render_mode is None:
             return None
@@ -90,5 +92,8 @@ def register() -> None:
     for task in TASKS:
         if GYMNASIUM_IDS[task] not in gymnasium.registry:
             gymnasium.register(
-                GYMNASIUM_IDS[task], entry_point=GymnasiumEnv, kwargs={"task": task}, order_enforce=True
+                GYMNASIUM_IDS[task],
+                entry_point="nht.envs.gymnasium_env:GymnasiumEnv",
+                kwargs={"task": task},
+                order_enforce=True,
             )

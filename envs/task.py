@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -57,7 +57,7 @@ class BatchedTask(ABC):
         ValueError: if a count is below 1.
     """
 
-    observation_sizes: dict[str, int]
+    observation_sizes: ClassVar[dict[str, int]]
     """Length of every observation by its key; ``"observation"`` is what a policy sees."""
 
     def __init__(
@@ -80,7 +80,6 @@ class BatchedTask(ABC):
         self.max_episode_steps = max_episode_steps
         self.num_threads = num_threads
         self.seed(seed)
-        self._restored = False
 
         full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
         self.state: Array = np.zeros((num_envs, mujoco.mj_stateSize(model, full_physics)))
@@ -98,6 +97,7 @@ class BatchedTask(ABC):
     def seed(self, seed: int) -> None:
         """Start the generator of all random draws anew."""
         self.rng = np.random.default_rng(seed)
+        self._restored = False
 
     # What a task adds.
 
@@ -152,8 +152,10 @@ class BatchedTask(ABC):
             raise ValueError(
                 f"expected actuation of shape {(self.num_envs, low.size)}, got {actuation.shape}."
             )
+        self._restored = False
+        applied = np.clip(actuation, low, high)
         invalid = ~np.isfinite(actuation).all(axis=1)
-        applied = np.clip(np.where(invalid[:, None], 0.0, actuation), low, high)
+        applied[invalid] = 0.0
         diverged = invalid | self._advance(applied)
         self.steps += 1
 
@@ -203,7 +205,7 @@ class BatchedTask(ABC):
         self.rng.bit_generator.state = saved["rng"]
         self._restored = True
 
-    _episode_arrays: tuple[str, ...] = ()
+    _episode_arrays: ClassVar[tuple[str, ...]] = ()
     """Names of the subclass's own per-copy arrays, each with N rows."""
 
     def decorate(self, scene: mujoco.MjvScene, row: int) -> None:

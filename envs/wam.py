@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from nht.envs.task import ASSETS, Array, BatchedTask, Flags
-from nht.envs.wam_kinematics import JOINT_HIGH, JOINT_LOW, MAX_SPEED, damped_solve, forward_kinematics
+from nht.envs.wam_kinematics import (
+    JOINT_HIGH,
+    JOINT_LOW,
+    MAX_SPEED,
+    damped_solve,
+    forward_kinematics,
+    tool_pose,
+)
 
 START_POSTURE = np.array([-0.2024, 0.4339, 0.0471, 2.1786, -0.0392, 0.5299, -0.1258])
 """The authors' start posture [rad]: the tool face lies flush on the table."""
@@ -20,6 +27,7 @@ GOAL_LOW, GOAL_HIGH = np.array([0.3, -0.25]), np.array([0.7, 0.25])
 """Goal area on the table, x and y [m]."""
 BRAKE_ZONE = 0.15
 """Within this angle of a limit [rad] a joint cannot move further towards it."""
+BRAKE_LOW, BRAKE_HIGH = JOINT_LOW + BRAKE_ZONE, JOINT_HIGH - BRAKE_ZONE
 DOWN = np.array([0.0, 0.0, -1.0])
 
 Start = Literal["fixed", "random"]
@@ -50,7 +58,12 @@ class WAMWipe(BatchedTask):
         ValueError: for an unknown start, or a tolerance or radius that is not positive.
     """
 
-    observation_sizes = {"observation": 16, "joint_angle": 7, "tool_position": 3, "goal": 3}
+    observation_sizes: ClassVar[dict[str, int]] = {
+        "observation": 16,
+        "joint_angle": 7,
+        "tool_position": 3,
+        "goal": 3,
+    }
     _episode_arrays = ("goal", "failed")
 
     def __init__(
@@ -133,8 +146,7 @@ class WAMWipe(BatchedTask):
         self.qvel[:] = brake(self.qpos, actuation)
 
     def _update_pose(self) -> None:
-        pose = forward_kinematics(self.qpos)
-        self._position, self._normal = pose.position, pose.normal
+        self._position, self._normal = tool_pose(self.qpos)
 
     def observe(self) -> dict[str, Array]:
         """Joint angles [rad], tool position and goal [m], and all of them with the face normal (16 numbers)."""
@@ -149,7 +161,7 @@ class WAMWipe(BatchedTask):
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
         self._update_pose()
         off_table = np.abs(self._position[:, 2] - TABLE_HEIGHT) > self.height_tolerance
-        tilted = self._normal @ DOWN < math.cos(self.tilt_tolerance)
+        tilted = self._normal[:, 2] > -math.cos(self.tilt_tolerance)
         self.failed |= off_table | tilted
         near = np.linalg.norm(self._position - self.goal, axis=1) < self.success_radius
         success = near & ~self.failed
@@ -173,7 +185,7 @@ class WAMWipe(BatchedTask):
         mujoco.mjv_initGeom(
             scene.geoms[scene.ngeom - 1],
             mujoco.mjtGeom.mjGEOM_CYLINDER,
-            np.array([self.success_radius, self.success_radius, 0.001]),
+            np.array([self.success_radius, 0.001, 0.0]),
             self.goal[row] + np.array([0.0, 0.0, 0.001]),
             np.eye(3).ravel(),
             np.array(colour, dtype=np.float32),
@@ -182,8 +194,8 @@ class WAMWipe(BatchedTask):
 
 def brake(joint_angle: Array, velocity: Array) -> Array:
     """The joint velocities ``(N, 7)`` without the components that press on towards a near joint limit."""
-    to_low = (joint_angle < JOINT_LOW + BRAKE_ZONE) & (velocity < 0)
-    to_high = (joint_angle > JOINT_HIGH - BRAKE_ZONE) & (velocity > 0)
+    to_low = (joint_angle < BRAKE_LOW) & (velocity < 0)
+    to_high = (joint_angle > BRAKE_HIGH) & (velocity > 0)
     return np.where(to_low | to_high, 0.0, velocity)
 
 
@@ -211,5 +223,5 @@ def flush_posture(target: Array, swivel: Array, iterations: int = 30) -> tuple[A
     pose = forward_kinematics(posture)
     exact = np.linalg.norm(pose.position - target, axis=1) < 1e-6
     straight = pose.normal[:, 2] < -1 + 1e-9
-    inside = ((posture > JOINT_LOW + BRAKE_ZONE) & (posture < JOINT_HIGH - BRAKE_ZONE)).all(axis=1)
+    inside = ((posture > BRAKE_LOW) & (posture < BRAKE_HIGH)).all(axis=1)
     return posture, exact & straight & inside

@@ -75,6 +75,33 @@ def forward_kinematics(joint_angle: Array) -> Pose:
     return Pose(position, np.ascontiguousarray(z), axes, origins)
 
 
+def tool_pose(joint_angle: Array) -> tuple[Array, Array]:
+    """Where the tool face is, without the joint axes: ``forward_kinematics`` at half the cost, for every step.
+
+    Carries the centre of the face and its normal from the tool's frame to the world's, one joint after the other.
+
+    Args:
+        joint_angle: ``(N, 7)`` [rad].
+
+    Returns:
+        Centre of the tool face [m] and unit vector out of it, each ``(N, 3)``.
+    """
+    angle = np.ascontiguousarray(joint_angle.T)
+    cos, sin = np.cos(angle), np.sin(angle)
+    # Row 0 is the point, which links shift; row 1 the direction. The last joint turns about both.
+    x, y, z = np.zeros((3, 2, joint_angle.shape[0]))
+    z[0], z[1] = D[6], 1.0
+    for joint in reversed(range(6)):
+        y, z = (-z, y) if QUARTER_TURNS[joint] > 0 else (z, -y)
+        if A[joint]:
+            x[0] += A[joint]
+        if D[joint]:
+            z[0] += D[joint]
+        x, y = cos[joint] * x - sin[joint] * y, sin[joint] * x + cos[joint] * y
+    position, normal = np.stack([x, y, z], axis=-1)
+    return position, normal
+
+
 def damped_solve(jacobian: Array, velocity: Array, damping: float = 1e-3) -> Array:
     """Joint velocity of least norm for a task velocity: J^T (J J^T + damping^2 I)^-1 velocity.
 

@@ -1,0 +1,1 @@
+"""Values of the recipes, as Hydra YAML."""

@@ -1,0 +1,1 @@
+"""Entry points: demonstrations, maps, reinforcement learning, evaluation. Where `nht` and `nht.envs` meet."""

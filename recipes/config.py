@@ -1,0 +1,148 @@
+"""What each recipe can be told: one dataclass per command, checked before anything runs.
+
+The YAML files under ``configs/`` hold the values; a key that is not a field here is an error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass
+class EnvConfig:
+    """Which task, and how many copies of it."""
+
+    name: str = "wam_wipe"
+    context_keys: list[str] = field(default_factory=list)  # what a map sees, in order
+    num_envs: int = 10
+    num_threads: int = 1
+    options: dict[str, Any] = field(default_factory=dict)  # of the task itself, in training and in evaluation
+
+
+@dataclass
+class DemosConfig:
+    """Where demonstrations come from: a folder, or else the task's scripted expert."""
+
+    path: str | None = None
+    transitions: int = 20_000
+    speed: float | None = None  # of the expert's tool [m/s]; None is its default
+    max_episode_steps: int = 1_000  # a demonstration ends at success, long before
+
+
+@dataclass
+class MapConfig:
+    """Which action map, and how it is trained."""
+
+    kind: str = "nht"  # nht, svd or none (raw actuation)
+    file: str | None = None  # a saved map; None trains one from the demonstrations
+    action_dim: int = 2
+    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    activation: str = "tanh"
+    lipschitz: float | None = None  # bound L on the whole map; None leaves it free
+    learning_rate: float = 1e-3
+    batch_size: int = 256
+    max_steps: int = 20_000
+    action_scale: float | None = 0.5  # actuation per unit of action; None takes the demonstrations' largest
+
+
+@dataclass
+class DDPGConfig:
+    """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
+
+    total_frames: int = 150_000
+    frames_per_batch: int = 200
+    updates_per_batch: int = 40
+    warmup_frames: int = 2_000  # collected before the first update
+    batch_size: int = 256
+    buffer_size: int = 1_000_000
+    hidden: list[int] = field(default_factory=lambda: [256, 256, 256])
+    actor_learning_rate: float = 1e-3
+    critic_learning_rate: float = 1e-3
+    gamma: float = 0.98
+    polyak: float = 0.98  # share of the old target network that stays at each move
+    target_update_every: int = 1  # gradient steps between two moves of the target networks
+    action_l2: float = 0.05  # weight of the mean squared action in the actor's loss
+    exploration_noise: float = 0.2  # standard deviation; actions lie in [-1, 1]
+    noise_memory: float = 1.0  # steps after which the noise has forgotten itself; 1 is white noise
+    random_action: float = 0.3  # probability of a uniform action instead
+    pessimism: float = 0.8  # the critic starts at -pessimism / (1 - gamma)
+    observation_clip: float = 5.0  # of the normalised observation
+
+
+@dataclass
+class EvaluationConfig:
+    """Deterministic episodes on environments and seeds of their own."""
+
+    every: int = 10_000  # frames between two evaluations
+    episodes: int = 100
+    video: bool = True  # of the final policy
+
+
+@dataclass
+class RunConfig:
+    """Where a run writes, and whether it goes on from what it finds there."""
+
+    folder: str = ""
+    resume: bool = False
+    checkpoint_every: int = 50_000  # frames
+    wandb: bool = True
+    wandb_project: str = "nht"
+
+
+@dataclass
+class CollectDemos:
+    """``python -m nht.recipes.collect_demos``."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    seed: int = 0
+    out: str = ""
+
+
+@dataclass
+class TrainMap:
+    """``python -m nht.recipes.train_map``."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    seed: int = 0
+    device: str = "cpu"
+    out: str = ""
+
+
+@dataclass
+class DDPG:
+    """``python -m nht.recipes.ddpg``."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    algo: DDPGConfig = field(default_factory=DDPGConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+    seed: int = 0
+    device: str = "cpu"
+    torch_threads: int = 1
+
+
+@dataclass
+class Evaluate:
+    """``python -m nht.recipes.evaluate``."""
+
+    run: str = ""  # folder of a finished run
+    episodes: int = 100
+    seed: int = 1_000_000
+    video: bool = True
+    video_episodes: int = 3
+    env_options: dict[str, Any] = field(default_factory=dict)  # laid over those of the run
+
+
+@dataclass
+class Report:
+    """``python -m nht.recipes.report``."""
+
+    runs: list[str] = field(default_factory=list)  # folders of runs, or folders that hold them
+    out: str = ""
+    title: str = ""

@@ -1,0 +1,44 @@
+"""Test a finished run's policy, and film it.
+
+python -m nht.recipes.evaluate run=runs/ddpg-wam_wipe-nht-seed0 video=true
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import nht
+from nht.recipes.config import DDPG, Evaluate
+from nht.recipes.environments import mapped_env
+from nht.recipes.evaluation import evaluate, record_video
+from nht.recipes.launch import launch
+from nht.recipes.networks import load_policy
+from nht.recipes.run_folder import read_config
+
+
+def main(config: Evaluate) -> None:
+    """Test, film, and say how it went."""
+    folder = Path(config.run)
+    trained = read_config(folder, DDPG)
+    env = replace(
+        trained.env, options=trained.env.options | {"terminate_on_failure": False} | config.env_options
+    )
+    map = nht.load_map(folder / "map.safetensors")
+
+    def build(copies: int):
+        return mapped_env(env, map, trained.map.action_scale, seed=config.seed, num_envs=copies)
+
+    tests = build(config.episodes)
+    policy = load_policy(folder, tests, trained.algo)
+    outcome = evaluate(tests, policy)
+    for name, value in outcome.metrics().items():
+        print(f"{name:>12}  {value:.3f}")
+    if config.video:
+        video = folder / "evaluation.mp4"
+        record_video(build(config.video_episodes), policy, video)
+        print(f"{video}")
+
+
+if __name__ == "__main__":
+    launch(main, Evaluate, "evaluate")

@@ -1,0 +1,79 @@
+"""From a command line of Hydra overrides to a checked dataclass."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+from hydra import compose, initialize_config_module
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+Config = TypeVar("Config")
+
+
+def launch(main: Callable[[Config], object], schema: type[Config], name: str) -> None:
+    """Run ``main`` with the configuration that the command line asks for; say in one line what is wrong with it.
+
+    Args:
+        main: the recipe.
+        schema: dataclass that ``main`` takes.
+        name: YAML file under ``configs/`` that holds the recipe's values.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        print(f"{(schema.__doc__ or '').strip()}\n\nValues, each of which `key=value` overrides:\n")
+        print(OmegaConf.to_yaml(_compose(schema, name, [])))
+        return
+    try:
+        config = configure(schema, name, arguments)
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    main(config)
+
+
+def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) -> Config:
+    """The recipe's configuration with the overrides applied.
+
+    Args:
+        schema: dataclass of the recipe.
+        name: YAML file under ``configs/``.
+        overrides: Hydra overrides such as ``"map=svd"`` or ``"algo.gamma=0.99"``.
+
+    Raises:
+        ValueError: for an unknown key or choice, or a value of a wrong type; the message lists what exists.
+    """
+    if flags := [word for word in overrides if word.startswith("-")]:
+        raise ValueError(
+            f"unknown flag {flags[0]!r}: settings are written key=value. "
+            "Hydra's multirun (-m) is not supported: start one process for each run."
+        )
+    try:
+        return OmegaConf.to_object(_compose(schema, name, overrides))  # type: ignore[return-value]
+    except (HydraException, OmegaConfBaseException) as error:
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise ValueError(f"{str(error).splitlines()[0]} ({reason}){_existing(schema, error)}") from error
+
+
+def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
+    ConfigStore.instance().store(name=f"{name}_schema", node=schema)
+    with initialize_config_module("nht.configs", version_base="1.3"):
+        return compose(name, overrides=list(overrides))
+
+
+def _existing(schema: type[Any], error: Exception) -> str:
+    """Names that exist where the error's key was looked for."""
+    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    full_key = getattr(cause, "full_key", None)
+    if not full_key:
+        # The lines after the first list the choices of a config group, where that was the mistake.
+        return " ".join(["", *str(error).splitlines()[1:]])
+    node: Any = schema()
+    for part in full_key.split(".")[:-1]:
+        node = getattr(node, part, node)
+    names = [entry.name for entry in fields(node)] if is_dataclass(node) else []
+    return f". Keys here: {names}." if names else ""

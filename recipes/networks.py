@@ -1,0 +1,113 @@
+"""The networks of the recipes, as TensorDict modules."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
+
+from nht.recipes.config import DDPGConfig
+from nht.recipes.losses import lowest_return
+
+
+class RunningNorm(nn.Module):
+    """Normalises by the mean and deviation of everything it was shown, and clips.
+
+    Unlike TorchRL's ``VecNorm`` it stands before the networks instead of in the environment, so that the replay
+    buffer holds raw observations and old ones are normalised by today's statistics.
+
+    Args:
+        size: width of the observation.
+        clip: largest absolute value put out.
+        floor: smallest deviation divided by.
+    """
+
+    count: Tensor
+    mean: Tensor
+    squares: Tensor
+
+    def __init__(self, size: int, clip: float = 5.0, floor: float = 0.01) -> None:
+        super().__init__()
+        self.clip, self.floor = clip, floor
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("squares", torch.zeros(size, dtype=torch.float64))  # summed squared deviations
+        self.register_buffer("shift", torch.zeros(size))
+        self.register_buffer("scale", torch.ones(size))
+
+    @torch.no_grad()
+    def update(self, observation: Tensor) -> None:
+        """Take ``(*batch, size)`` observations into the statistics (Chan et al.'s pairwise update)."""
+        rows = observation.reshape(-1, observation.shape[-1]).double()
+        deviation = rows.mean(0) - self.mean
+        total = self.count + len(rows)
+        self.squares += rows.var(0, correction=0) * len(rows) + deviation**2 * self.count * len(rows) / total
+        self.mean += deviation * len(rows) / total
+        self.count.copy_(total)
+        self.shift.copy_(self.mean)
+        self.scale.copy_((self.squares / total).sqrt().clamp_min(self.floor))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Normalised observations of the same shape."""
+        return ((observation - self.shift) / self.scale).clamp(-self.clip, self.clip)
+
+
+def ddpg_networks(
+    env: EnvBase, algo: DDPGConfig
+) -> tuple[TensorDictModule, TensorDictModule, TensorDictModule]:
+    """Normaliser, actor and critic for ``env``.
+
+    Returns:
+        the normaliser, ``"observation"`` to ``"features"``; the actor, features to an ``"action"`` in [-1, 1]^k; and
+        the critic, features and action to a ``"state_action_value"`` that starts near ``-pessimism / (1 - gamma)``.
+    """
+    size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+    norm = RunningNorm(size, algo.observation_clip).to(env.device)
+    hidden = {"num_cells": list(algo.hidden), "activation_class": nn.ReLU, "device": env.device}
+    actor = nn.Sequential(MLP(size, action_dim, **hidden), nn.Tanh())
+    critic = MLP(size + action_dim, 1, **hidden)
+    nn.init.constant_(critic[-1].bias, algo.pessimism * lowest_return(algo.gamma))
+    return (
+        TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
+        TensorDictModule(actor, in_keys=["features"], out_keys=["action"]),
+        TensorDictModule(critic, in_keys=["features", "action"], out_keys=["state_action_value"]),
+    )
+
+
+def exploring(policy: TensorDictModule, env: EnvBase, algo: DDPGConfig) -> TensorDictSequential:
+    """The policy with noise added to its actions, or, at times, a uniform action instead.
+
+    The noise is an Ornstein-Uhlenbeck process of deviation ``exploration_noise`` whose autocorrelation falls by
+    ``1 / noise_memory`` a step; with a memory of 1 it is white.
+    """
+    rate = 1.0 / algo.noise_memory
+    sigma = algo.exploration_noise * math.sqrt(rate * (2.0 - rate))
+    noise = OrnsteinUhlenbeckProcessModule(
+        env.action_spec, eps_init=1.0, eps_end=1.0, theta=rate, sigma=sigma, dt=1.0, device=env.device
+    )
+    uniform = EGreedyModule(env.action_spec, algo.random_action, algo.random_action, device=env.device)
+    return TensorDictSequential(policy, noise, uniform)
+
+
+def save_policy(policy: nn.Module, folder: Path) -> None:
+    """Write the deterministic policy, its normaliser included, to ``policy.safetensors``."""
+    save_file(policy.state_dict(), folder / "policy.safetensors")
+
+
+def load_policy(folder: Path, env: EnvBase, algo: DDPGConfig) -> TensorDictSequential:
+    """The policy of a finished run, for an environment like the run's.
+
+    Raises:
+        FileNotFoundError: if the run has not finished.
+        RuntimeError: if the policy does not fit the environment.
+    """
+    features, actor, _ = ddpg_networks(env, algo)
+    policy = TensorDictSequential(features, actor)
+    policy.load_state_dict(load_file(folder / "policy.safetensors"))
+    return policy

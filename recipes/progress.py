@@ -1,0 +1,64 @@
+"""What a run counts between two evaluations."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import asdict, dataclass
+
+import torch
+from tensordict import TensorDictBase
+
+
+@dataclass
+class Counters:
+    """How far a run has come; checkpointed."""
+
+    frames: int = 0
+    updates: int = 0
+
+    def state_dict(self) -> dict[str, int]:
+        """The counters by name."""
+        return asdict(self)
+
+    def load_state_dict(self, saved: dict[str, int]) -> None:
+        """Go on counting from ``saved``."""
+        self.frames, self.updates = saved["frames"], saved["updates"]
+
+
+class TrainingStatistics:
+    """Means since the last evaluation: losses, and outcomes of the episodes that ended in training."""
+
+    def __init__(self) -> None:
+        self._clear()
+
+    def _clear(self) -> None:
+        self._sums: dict[str, torch.Tensor | float] = defaultdict(float)
+        self._updates = self._episodes = 0
+
+    def add_losses(self, losses: TensorDictBase) -> None:
+        """Count one update; the sums stay tensors, so that nothing waits for the device."""
+        self._updates += 1
+        for name, value in losses.items():
+            self._sums[name] = self._sums[name] + value.detach()
+
+    def add_steps(self, steps: TensorDictBase) -> None:
+        """Count the episodes that end among ``(T,)`` collected steps, and copies that diverged."""
+        outcome = steps["next"]
+        done = outcome["done"]
+        self._episodes += int(done.sum())
+        for name in ("success", "failure"):
+            self._sums[name] += float((outcome[name] & done).sum())
+        self._sums["diverged"] += float(outcome["diverged"].sum())
+
+    def take(self) -> dict[str, float]:
+        """The means, starting anew; NaN where nothing was counted."""
+        updates, episodes = self._updates or float("nan"), self._episodes or float("nan")
+        row = {
+            "train_success": self._sums["success"] / episodes,
+            "train_failure": self._sums["failure"] / episodes,
+            "diverged": self._sums["diverged"],
+            "loss_actor": float(self._sums["loss_actor"]) / updates,
+            "loss_value": float(self._sums["loss_value"]) / updates,
+        }
+        self._clear()
+        return {name: float(value) for name, value in row.items()}

@@ -1,0 +1,120 @@
+"""The folder of a run: configuration, metrics, checkpoints, videos and W&B files."""
+
+from __future__ import annotations
+
+import csv
+import os
+import time
+from dataclasses import asdict
+from netrc import NetrcParseError, netrc
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import pandas
+import wandb
+import yaml
+from omegaconf import OmegaConf
+from torchrl.record.loggers.wandb import WandbLogger
+from tqdm import tqdm
+
+from nht.recipes.config import RunConfig
+
+Config = TypeVar("Config")
+
+
+class RunFolder:
+    """Where one run writes. ``metrics.csv`` has a row per evaluation; W&B gets the same numbers.
+
+    Args:
+        run: folder, resume and W&B settings.
+        config: the whole configuration of the run, a dataclass, saved as ``config.yaml``.
+
+    Raises:
+        FileExistsError: if the folder holds a run already and ``run.resume`` is not set.
+        FileNotFoundError: if ``run.resume`` is set and there is nothing to resume.
+    """
+
+    def __init__(self, run: RunConfig, config: Any) -> None:
+        self.path = Path(run.folder)
+        self._started = time.perf_counter()
+        self.metrics = self.path / "metrics.csv"
+        settings = self.path / "config.yaml"
+        if run.resume and not settings.exists():
+            raise FileNotFoundError(f"{self.path} holds no run to resume.")
+        if not run.resume and settings.exists():
+            raise FileExistsError(
+                f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
+            )
+        self.path.mkdir(parents=True, exist_ok=True)
+        if not run.resume:
+            settings.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
+        self._wandb = self._start_wandb(run, config) if run.wandb else None
+
+    def _start_wandb(self, run: RunConfig, config: Any) -> WandbLogger:
+        os.environ.setdefault("WANDB_SILENT", "true")
+        return WandbLogger(
+            exp_name=self.path.name,
+            save_dir=str(self.path),
+            project=run.wandb_project,
+            offline=not _logged_in(),
+            config=asdict(config),
+        )
+
+    def log(self, frames: int, row: dict[str, float]) -> None:
+        """Append a row to ``metrics.csv`` and send it to W&B, against environment steps."""
+        row = {"frames": frames, **row, "seconds": time.perf_counter() - self._started}
+        fresh = not self.metrics.exists()
+        with self.metrics.open("a", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(row))
+            if fresh:
+                writer.writeheader()
+            writer.writerow(row)
+        if self._wandb is not None:
+            self._wandb.experiment.log(row, step=frames)
+
+    def rewind(self, frames: int) -> None:
+        """Drop the rows behind ``frames``: a resumed run writes them again."""
+        with self.metrics.open(newline="") as file:
+            rows = list(csv.reader(file))
+        kept = [rows[0], *(row for row in rows[1:] if int(row[0]) <= frames)]
+        with self.metrics.open("w", newline="") as file:
+            csv.writer(file).writerows(kept)
+
+    def progress_bar(self, total: int, initial: int) -> tqdm[NoReturn]:
+        """A bar over environment steps."""
+        return tqdm(total=total, initial=initial, desc=self.path.name, unit="step", unit_scale=True)
+
+    def finish(self) -> None:
+        """Hand video and map to W&B, and say what happened and where the files are."""
+        if self._wandb is not None:
+            if (video := self.path / "video.mp4").exists():
+                self._wandb.experiment.log({"video": wandb.Video(str(video), format="mp4")})
+            artifact = wandb.Artifact(f"map-{self.path.name}", type="action-map")
+            artifact.add_file(str(self.path / "map.safetensors"))
+            self._wandb.experiment.log_artifact(artifact)
+            self._wandb.experiment.finish()
+        rows = pandas.read_csv(self.metrics)
+        print(rows[["frames", "eval_success", "eval_failure", "eval_return"]].tail(5).to_string(index=False))
+        print(f"\n{self.path}: " + ", ".join(sorted(entry.name for entry in self.path.iterdir())))
+
+
+def read_config(folder: Path, schema: type[Config]) -> Config:
+    """The configuration that a run was started with.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run.
+    """
+    settings = folder / "config.yaml"
+    if not settings.exists():
+        raise FileNotFoundError(f"{folder} holds no run: it has no config.yaml.")
+    return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(settings)))
+
+
+def _logged_in() -> bool:
+    """Whether W&B has a key here: from the environment or from its login."""
+    if mode := os.environ.get("WANDB_MODE"):
+        return mode == "online"
+    try:
+        return "WANDB_API_KEY" in os.environ or netrc().authenticators("api.wandb.ai") is not None
+    except (FileNotFoundError, NetrcParseError):
+        return False

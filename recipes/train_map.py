@@ -1,0 +1,87 @@
+"""An action map from demonstrations.
+
+python -m nht.recipes.train_map map=nht demos.path=runs/demos-wam_wipe
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from tqdm import tqdm
+
+import nht
+from nht.recipes.collect_demos import collect_demos
+from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
+from nht.recipes.launch import launch
+
+
+def main(config: TrainMap) -> None:
+    """Train a map, save it and say how well it fits."""
+    out = Path(config.out)
+    if out.exists():
+        raise FileExistsError(f"{out} exists: maps are never overwritten. Choose another file.")
+    trained = train_map(config.map, config.env, config.demos, config.seed, config.device)
+    nht.save_map(trained.map, out)
+    for name, value in trained.metrics.items():
+        print(f"{name:>20}  {value:.6g}")
+    print(f"saved in {out}")
+
+
+def train_map(
+    map: MapConfig, env: EnvConfig, demos: DemosConfig, seed: int, device: str = "cpu"
+) -> nht.MapTraining:
+    """Train the map that ``map`` describes; without a folder of demonstrations the expert gives them.
+
+    Raises:
+        ValueError: for an unknown kind of map, or demonstrations of another task.
+    """
+    with TemporaryDirectory() as scratch:
+        if demos.path is None:
+            data = collect_demos(env, demos, seed, Path(scratch) / "demos")
+        else:
+            data = nht.load_demos(demos.path, env=env.name)
+        context_dim = data.context(env.context_keys).shape[-1]
+        with tqdm(total=map.max_steps, desc=f"map {map.kind}", unit="step", unit_scale=True) as bar:
+
+            def show(metrics: dict[str, float]) -> None:
+                bar.set_postfix(error=f"{metrics['validation_error']:.2e}", refresh=False)
+                bar.update(int(metrics["step"]) - bar.n)
+
+            return nht.train_map(
+                data,
+                make_map(map, context_dim, data.actuation.shape[-1], seed).to(device),
+                context_keys=env.context_keys,
+                batch_size=map.batch_size,
+                learning_rate=map.learning_rate,
+                max_steps=map.max_steps,
+                seed=seed,
+                progress=show,
+            )
+
+
+def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) -> nht.ActionMap:
+    """The untrained map of a kind.
+
+    Raises:
+        ValueError: for an unknown kind; the message lists those that exist.
+    """
+    if map.kind == "nht":
+        return nht.NHT(
+            context_dim,
+            actuation_dim,
+            map.action_dim,
+            hidden=tuple(map.hidden),
+            activation=map.activation,
+            lipschitz=map.lipschitz,
+            seed=seed,
+        )
+    if map.kind == "svd":
+        return nht.SVD(actuation_dim, map.action_dim, context_dim=context_dim)
+    if map.kind == "none":
+        return nht.Identity(actuation_dim, context_dim=context_dim)
+    raise ValueError(f"unknown map kind {map.kind!r}: choose nht, svd or none.")
+
+
+if __name__ == "__main__":
+    launch(main, TrainMap, "train_map")
