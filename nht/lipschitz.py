@@ -10,7 +10,7 @@ context.
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap
@@ -82,21 +82,15 @@ class LipschitzProjection:
             self._scale(i, torch.linalg.vector_norm(singular) if self.frobenius else singular[0])
 
     def _scale(self, index: int, norm: Tensor) -> None:
-        _linear(self.network, index).weight.mul_((self.limits[index] / norm).clamp_max(1))
+        self.network.linear(index).weight.mul_((self.limits[index] / norm).clamp_max(1))
 
 
 def _matrices(network: ContextNetwork) -> list[Tensor]:
     """The layers' matrices, the first one as it acts on the raw context."""
-    weights = [_linear(network, i).weight for i in range(len(network.layers))]
+    weights = [network.linear(i).weight for i in range(len(network.layers))]
     return [weights[0] / network.context_std, *weights[1:]]
 
 
 def _slopes(network: ContextNetwork) -> list[float]:
     """The largest slope of what follows each layer; nothing follows the last."""
     return [ACTIVATION_SLOPES[network.activation]] * (len(network.layers) - 1) + [1.0]
-
-
-def _linear(network: ContextNetwork, index: int) -> nn.Linear:
-    layer = network.layers[index]
-    assert isinstance(layer, nn.Linear)
-    return layer

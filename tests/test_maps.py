@@ -153,7 +153,7 @@ def test_the_normaliser_centres_and_scales_but_does_not_amplify_what_hardly_move
     network.normalise(context)
     assert torch.allclose(network.context_mean, context.mean(0))
     std = context.std(0, correction=0)
-    assert torch.allclose(network.context_std, torch.stack([std[0], std[1], std[0] / 100, std[0] / 100]))
+    assert torch.allclose(network.context_std, torch.stack([std[0], std[1], std[0] / 10, std[0] / 10]))
     network.normalise(torch.full((9, CONTEXT_DIM), 2.0, dtype=torch.float64))
     assert torch.equal(network.context_std, torch.ones(CONTEXT_DIM, dtype=torch.float64))
 
