@@ -63,14 +63,17 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
     found = header.get("format_version")
     if found != str(FORMAT_VERSION):
         raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}")
-    description = json.loads(header["map"])
-    map = _untrained(description, path)
-    _fill(map, tensors, path)
-    keys = description["context_keys"]
+    try:
+        description = json.loads(header["map"])
+        map = _untrained(description, path)
+        keys = description["context_keys"]
+        map.data_fingerprint = description["data_fingerprint"]
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is an action map, but its description is damaged: {error}") from error
     map.context_keys = (
         None if keys is None else tuple(key if isinstance(key, str) else tuple(key) for key in keys)
     )
-    map.data_fingerprint = description["data_fingerprint"]
+    _fill(map, tensors, path)
     return map.to(device).eval().requires_grad_(False)
 
 
