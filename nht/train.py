@@ -1,6 +1,7 @@
 """Offline training of an action map from demonstrations."""
 
 import copy
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -166,6 +167,8 @@ def _keep_best(
     best_error, best_step, step = float("inf"), 0, 0
     best_weights = map.state_dict()
     for step, loss in rounds:
+        if not math.isfinite(loss):
+            break
         error = projection_error(map, validation["context"], validation["actuation"])
         if error < best_error:
             best_error, best_step, best_weights = error, step, copy.deepcopy(map.state_dict())
@@ -175,9 +178,7 @@ def _keep_best(
         if step - best_step >= patience:
             break
     if best_step == 0:
-        raise FloatingPointError(
-            f"training diverged: no finite validation error in {step} steps; lower learning_rate"
-        )
+        raise FloatingPointError(f"training diverged in the first {step} steps; lower learning_rate")
     map.load_state_dict(best_weights)
     return step, best_step
 
