@@ -52,8 +52,8 @@ test: lint typecheck ## Lint, types and all tests but the slow ones
 test-slow: setup ## The slow tests: learning, processes, compilation
 	$(BIN)/pytest -m slow
 
-demo: setup ## The main job from demonstrations to a trained policy, beside raw actuation
-	$(BIN)/python -m nht.recipes.demo
+demo: setup ## The main job: demonstrations, map, DDPG through it and on raw joints, table, plot and videos
+	@OMP_NUM_THREADS=1 recipes/demo.sh $(BIN)/python
 
 bench: setup ## Run every benchmarks/bench_*.py
 	@for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python "$$file"; done

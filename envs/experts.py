@@ -27,8 +27,8 @@ class WipeExpert(Expert):
     one of least norm that gives it.
 
     Args:
-        speed: largest speed of the tool over the table [m/s]. At 0.2 an episode takes about 50 steps, at 0.03 about
-            the 250 of the paper's demonstrations (which then need a longer time limit than 200).
+        speed: largest speed of the tool over the table [m/s]. At 0.2 an episode takes about 50 steps, at 0.032
+            about the 250 of the paper's demonstrations, which then need a time limit of 700 instead of 200.
         gain: how fast errors of position, height and tilt are driven out [1/s].
 
     Raises:

@@ -97,7 +97,6 @@ class BatchedTask(ABC):
     def seed(self, seed: int) -> None:
         """Start the generator of all random draws anew."""
         self.rng = np.random.default_rng(seed)
-        self._restored = False
 
     # What a task adds.
 
@@ -127,9 +126,6 @@ class BatchedTask(ABC):
     def reset(self, rows: NDArray[np.intp] | None = None) -> None:
         """Start a new episode in the copies ``rows`` (all by default) and leave the others alone."""
         self._check_open()
-        restored, self._restored = self._restored, False
-        if restored and rows is None:
-            return
         rows = np.arange(self.num_envs) if rows is None else rows
         self.state[rows] = 0.0
         self.steps[rows] = 0
@@ -152,7 +148,6 @@ class BatchedTask(ABC):
             raise ValueError(
                 f"expected actuation of shape {(self.num_envs, low.size)}, got {actuation.shape}."
             )
-        self._restored = False
         applied = np.clip(actuation, low, high)
         invalid = ~np.isfinite(actuation).all(axis=1)
         applied[invalid] = 0.0
@@ -184,10 +179,10 @@ class BatchedTask(ABC):
             state=self._trajectory,
         )
         after = self._trajectory[:, -1]
-        # MuJoCo answers bad numbers by a reset of the simulation: its clock then falls behind.
+        # MuJoCo answers bad numbers by a reset of the simulation and then stands still: its clock falls behind.
         elapsed = after[:, 0] - self.state[:, 0]
-        expected = self.substeps * self.model.opt.timestep
-        diverged = ~(np.isfinite(after).all(axis=1) & (elapsed > 0.5 * expected))
+        expected = (self.substeps - 0.5) * self.model.opt.timestep
+        diverged = ~(np.isfinite(after).all(axis=1) & (elapsed > expected))
         if diverged.any():
             after = np.where(diverged[:, None], self.state, after)
         self.state[:] = after
@@ -199,11 +194,10 @@ class BatchedTask(ABC):
         return {**arrays, "rng": self.rng.bit_generator.state}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned: the next reset of all copies then leaves them as they are."""
+        """Go on from what ``state_dict`` returned."""
         for name in ("state", "steps", *self._episode_arrays):
             getattr(self, name)[:] = saved[name]
         self.rng.bit_generator.state = saved["rng"]
-        self._restored = True
 
     _episode_arrays: ClassVar[tuple[str, ...]] = ()
     """Names of the subclass's own per-copy arrays, each with N rows."""

@@ -42,32 +42,48 @@ class MapConfig:
     lipschitz: float | None = None  # bound L on the whole map; None leaves it free
     learning_rate: float = 1e-3
     batch_size: int = 256
-    max_steps: int = 20_000
-    action_scale: float | None = 0.5  # actuation per unit of action; None takes the demonstrations' largest
+    max_steps: int = 6_000
+    action_scale: float | None = 1.0  # actuation per unit of action; None takes the demonstrations' largest
 
 
 @dataclass
 class DDPGConfig:
     """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
 
-    total_frames: int = 150_000
+    total_frames: int = 100_000
     frames_per_batch: int = 200
-    updates_per_batch: int = 40
+    updates_per_batch: int = 20
     warmup_frames: int = 2_000  # collected before the first update
     batch_size: int = 256
     buffer_size: int = 1_000_000
-    hidden: list[int] = field(default_factory=lambda: [256, 256, 256])
+    hidden: list[int] = field(default_factory=lambda: [256, 256])
     actor_learning_rate: float = 1e-3
     critic_learning_rate: float = 1e-3
     gamma: float = 0.98
-    polyak: float = 0.98  # share of the old target network that stays at each move
+    polyak: float = 0.96  # share of the old target network that stays at each move
     target_update_every: int = 1  # gradient steps between two moves of the target networks
     action_l2: float = 0.05  # weight of the mean squared action in the actor's loss
-    exploration_noise: float = 0.2  # standard deviation; actions lie in [-1, 1]
-    noise_memory: float = 1.0  # steps after which the noise has forgotten itself; 1 is white noise
-    random_action: float = 0.3  # probability of a uniform action instead
+    exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
+    noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
+    random_action: float = 0.1  # probability of a uniform action instead
     pessimism: float = 0.8  # the critic starts at -pessimism / (1 - gamma)
     observation_clip: float = 5.0  # of the normalised observation
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a value outside its range."""
+        if not 0 < self.gamma < 1:
+            raise ValueError(f"algo.gamma must lie in (0, 1), got {self.gamma}.")
+        for name in ("polyak", "random_action", "pessimism"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"algo.{name} must lie in [0, 1], got {getattr(self, name)}.")
+        for name in ("total_frames", "frames_per_batch", "batch_size", "buffer_size", "target_update_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"algo.{name} must be at least 1, got {getattr(self, name)}.")
+        for name in ("action_l2", "exploration_noise", "updates_per_batch", "warmup_frames"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"algo.{name} must not be negative, got {getattr(self, name)}.")
+        if self.noise_memory < 1:
+            raise ValueError(f"algo.noise_memory must be at least 1 step, got {self.noise_memory}.")
 
 
 @dataclass
@@ -125,6 +141,21 @@ class DDPG:
     seed: int = 0
     device: str = "cpu"
     torch_threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for settings that do not go together."""
+        frames = {"algo.total_frames": self.algo.total_frames, "evaluation.every": self.evaluation.every}
+        frames["run.checkpoint_every"] = self.run.checkpoint_every
+        for name, value in frames.items():
+            if value < self.algo.frames_per_batch or value % self.algo.frames_per_batch:
+                raise ValueError(
+                    f"{name} must be a multiple of algo.frames_per_batch={self.algo.frames_per_batch}, got {value}."
+                )
+        if self.algo.frames_per_batch % self.env.num_envs:
+            raise ValueError(
+                f"algo.frames_per_batch={self.algo.frames_per_batch} must be a multiple of "
+                f"env.num_envs={self.env.num_envs}: every copy makes the same number of steps."
+            )
 
 
 @dataclass

@@ -18,7 +18,7 @@ from nht.recipes.evaluation import evaluate, record_video
 from nht.recipes.launch import launch
 from nht.recipes.losses import PaperDDPGLoss, charge_failure
 from nht.recipes.networks import ddpg_networks, exploring, save_policy
-from nht.recipes.progress import Counters, TrainingStatistics
+from nht.recipes.progress import CollectorState, Counters, TrainingStatistics
 from nht.recipes.run_folder import RunFolder
 
 VIDEO_EPISODES = 3
@@ -34,7 +34,7 @@ STORED = (
 
 def main(config: DDPG) -> None:
     """Train, evaluate on the way, and say at the end what happened."""
-    algo, device, frames_per_batch = config.algo, config.device, config.algo.frames_per_batch
+    algo, device = config.algo, config.device
     torch.set_num_threads(config.torch_threads)
     torch.manual_seed(config.seed)
     run = RunFolder(config.run, config)
@@ -57,29 +57,31 @@ def main(config: DDPG) -> None:
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(algo.buffer_size, device=device), batch_size=algo.batch_size
     )
+    collector = Collector(
+        env,
+        exploring(policy, env, algo),
+        frames_per_batch=algo.frames_per_batch,
+        total_frames=-1,
+        track_traj_ids=False,
+        auto_register_policy_transforms=True,
+    )
     counters = Counters()
     checkpoint = Checkpoint(
         loss=loss,
         optimiser=optimiser,
         features=features,
         buffer=buffer,
+        collector=CollectorState(collector),
         simulator=env.base_env.task,
-        counters=counters,
+        test_simulator=tests.base_env.task,
         random=GlobalRNGState(),
+        counters=counters,
     )
     rotation = CheckpointRotation(run.path / "checkpoints", keep_last=2)
     if config.run.resume:
         rotation.load_latest(checkpoint)
         run.rewind(counters.frames)
 
-    collector = Collector(
-        env,
-        exploring(policy, env, algo),
-        frames_per_batch=frames_per_batch,
-        total_frames=algo.total_frames - counters.frames,
-        track_traj_ids=False,
-        auto_register_policy_transforms=True,
-    )
     progress = run.progress_bar(algo.total_frames, counters.frames)
     training = TrainingStatistics()
     for data in collector:
@@ -103,12 +105,14 @@ def main(config: DDPG) -> None:
             training.add_losses(losses.select("loss_actor", "loss_value"))
 
         progress.update(data.numel())
-        if counters.frames % config.evaluation.every < frames_per_batch:
+        if counters.frames % config.evaluation.every == 0:
             row = training.take() | evaluate(tests, policy).metrics()
             run.log(counters.frames, row | {"updates": counters.updates})
             progress.set_postfix(success=row["eval_success"])
-        if counters.frames % config.run.checkpoint_every < frames_per_batch:
+        if counters.frames % config.run.checkpoint_every == 0:
             rotation.save(checkpoint, step=counters.frames)
+        if counters.frames >= algo.total_frames:
+            break
     collector.shutdown()
     progress.close()
     save_policy(policy, run.path)

@@ -11,7 +11,7 @@ from torchrl.envs import TransformedEnv
 import nht
 from nht.envs import make_env
 from nht.recipes.config import DDPG, EnvConfig
-from nht.recipes.train_map import train_map
+from nht.recipes.train_map import load_kind, train_map
 from nht.transforms import ActionMapTransform
 
 
@@ -55,13 +55,13 @@ def run_map(config: DDPG, folder: Path) -> nht.ActionMap:
     """The run's action map, which the run's folder keeps: the given file, else one trained on demonstrations.
 
     Raises:
-        ValueError: if the given file is not a readable map.
+        ValueError: if the given file is not a readable map, or one of another kind.
     """
     kept = folder / "map.safetensors"
     if not kept.exists():
-        given = config.map.file
-        trained = (
-            nht.load_map(given) if given else train_map(config.map, config.env, config.demos, config.seed).map
-        )
-        nht.save_map(trained, kept)
+        if config.map.file is None:
+            map = train_map(config.map, config.env, config.demos, config.seed).map
+        else:
+            map = load_kind(config.map.file, config.map.kind)
+        nht.save_map(map, kept)
     return nht.load_map(kept, device=config.device)

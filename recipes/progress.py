@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.collectors import Collector
 
 
 @dataclass
@@ -23,6 +26,21 @@ class Counters:
     def load_state_dict(self, saved: dict[str, int]) -> None:
         """Go on counting from ``saved``."""
         self.frames, self.updates = saved["frames"], saved["updates"]
+
+
+class CollectorState:
+    """Where a collector stands between two batches (observation, exploration noise), to be checkpointed."""
+
+    def __init__(self, collector: Collector) -> None:
+        self._collector = collector
+
+    def state_dict(self) -> dict[str, Any]:
+        """Every entry that the next step starts from."""
+        return self._collector._carrier.to_dict()
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Start the next step from ``saved``."""
+        self._collector._carrier.update(saved)
 
 
 class TrainingStatistics:
@@ -51,7 +69,16 @@ class TrainingStatistics:
         self._sums["diverged"] += float(outcome["diverged"].sum())
 
     def take(self) -> dict[str, float]:
-        """The means, starting anew; NaN where nothing was counted."""
+        """The means, starting anew; NaN where nothing was counted.
+
+        Raises:
+            FloatingPointError: if a loss is no longer finite: the networks are lost.
+        """
+        for name, value in self._sums.items():
+            if not math.isfinite(value):
+                raise FloatingPointError(
+                    f"{name} is {float(value)}: training diverged. Lower the learning rates."
+                )
         updates, episodes = self._updates or float("nan"), self._episodes or float("nan")
         row = {
             "train_success": self._sums["success"] / episodes,

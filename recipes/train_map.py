@@ -15,6 +15,9 @@ from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
 from nht.recipes.launch import launch
 
+KINDS: dict[str, type[nht.ActionMap]] = {"nht": nht.NHT, "svd": nht.SVD, "none": nht.Identity}
+"""Every kind of map by the name that configurations use."""
+
 
 def main(config: TrainMap) -> None:
     """Train a map, save it and say how well it fits."""
@@ -78,9 +81,26 @@ def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) ->
         )
     if map.kind == "svd":
         return nht.SVD(actuation_dim, map.action_dim, context_dim=context_dim)
-    if map.kind == "none":
-        return nht.Identity(actuation_dim, context_dim=context_dim)
-    raise ValueError(f"unknown map kind {map.kind!r}: choose nht, svd or none.")
+    _check_kind(map.kind)
+    return nht.Identity(actuation_dim, context_dim=context_dim)
+
+
+def load_kind(path: str | Path, kind: str) -> nht.ActionMap:
+    """The map in a file, which must be of the given kind.
+
+    Raises:
+        ValueError: if it is not, for a run would carry the wrong name.
+    """
+    _check_kind(kind)
+    map = nht.load_map(path)
+    if type(map) is not KINDS[kind]:
+        raise ValueError(f"{path} holds a {type(map).__name__}, but map.kind is {kind!r}.")
+    return map
+
+
+def _check_kind(kind: str) -> None:
+    if kind not in KINDS:
+        raise ValueError(f"unknown map kind {kind!r}: choose from {sorted(KINDS)}.")
 
 
 if __name__ == "__main__":
