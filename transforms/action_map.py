@@ -7,53 +7,20 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.data.tensor_specs import ContinuousBox
+from torchrl.data.tensor_specs import Stacked
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, Transform, VecGymEnvTransform
+from torchrl.envs.transforms import Transform
 
 from nht import ActionMap, load_map
-
-
-class ContextSnapshot(Transform):
-    """Writes the raw context, entries of the observation side by side, under a key of its own.
-
-    `ActionMapTransform` has one, and puts it in front of the transforms that come before it.
-
-    Args:
-        context_keys: entries of the observation, (*batch, width) each, in the order of concatenation.
-        context_key: where the snapshot goes, (*batch, context_dim).
-        dtype: of the snapshot.
-    """
-
-    def __init__(
-        self, context_keys: Sequence[NestedKey], context_key: NestedKey, dtype: torch.dtype = torch.float32
-    ) -> None:
-        super().__init__(in_keys=list(context_keys), out_keys=[context_key])
-        self.dtype = dtype
-
-    def read(self, tensordict: TensorDictBase) -> Tensor:
-        """The context in raw observations, (*batch, context_dim).
-
-        Always a copy, for environments may reuse the buffers that they hand out.
-        """
-        return torch.cat([tensordict[key] for key in self._in_keys], -1).to(self.dtype)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set(self._out_keys[0], self.read(next_tensordict))
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Registers the snapshot: collectors drop what is not in the specs."""
-        shapes = [observation_spec[key].shape for key in self.in_keys]
-        shape = (*shapes[0][:-1], sum(shape[-1] for shape in shapes))
-        observation_spec[self.out_keys[0]] = Unbounded(
-            shape, dtype=self.dtype, device=observation_spec.device
-        )
-        return observation_spec
+from nht.transforms.context import (
+    ContextSnapshot,
+    check_context,
+    check_writers,
+    surroundings,
+    transformed_spec,
+)
 
 
 class ActionMapTransform(Transform):
@@ -64,8 +31,8 @@ class ActionMapTransform(Transform):
     The map sees the raw context, that of `env.base_env`, wherever this transform stands among others. TorchRL
     inverts actions only after all transforms have rewritten the observation; a copy of the raw context therefore
     travels in the tensordict. Where other transforms come before this one, a `ContextSnapshot` that takes the copy
-    is put in front of them when the environment is attached. What transforms add to an observation is not raw: to
-    take it for context, wrap the transformed environment once more, with `auto_unwrap=False`.
+    is put in front of them when the environment is attached. Only if an entry of the context is itself made by a
+    transform before this one, say the tool's position from joint angles, the copy is taken here.
 
     Three entries stand in the data, registered in the specs:
 
@@ -98,7 +65,8 @@ class ActionMapTransform(Transform):
         TypeError: if `map` is no ActionMap; on attaching, if a context entry or the actuation is not of floats.
         ValueError: on an `action_scale` that is not positive and finite, on context keys that are missing or in
             another order than the map's, on keys that collide; on attaching, if the width of context or actuation
-            is not the map's, or if the environment has entries of its own under our keys.
+            is not the map's, if the environment has entries of its own under our keys, or if another transform
+            came between raw context and copy.
         KeyError: on attaching, if the environment lacks a context key or the actuation key.
     """
 
@@ -108,7 +76,7 @@ class ActionMapTransform(Transform):
     _low: Tensor | None
     _high: Tensor | None
     _executed_spec: Unbounded
-    _context_shape: tuple[int, ...]
+    _context_shape: torch.Size
 
     def __init__(
         self,
@@ -218,16 +186,22 @@ class ActionMapTransform(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Registers what is added to the data: collectors drop what is not in the specs."""
         self._attach()
-        device = observation_spec.device
-        if self.snapshot is not None:
-            observation_spec[self.context_key] = Unbounded(
-                self._context_shape, dtype=self.dtype, device=device
-            )
-        executed_spec = self._executed_spec.to(device) if device is not None else self._executed_spec
+        executed_spec = self._executed_spec
+        if (device := observation_spec.device) is not None:
+            executed_spec = executed_spec.to(device)
         observation_spec[self.executed_key] = executed_spec.expand(
             *observation_spec.shape, *executed_spec.shape
         )
-        return observation_spec
+        return self._with_context(observation_spec)
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        """Registers the context as an input too: worker processes are sent nothing else along with the action."""
+        return self._with_context(state_spec)
+
+    def _with_context(self, spec: Composite) -> Composite:
+        if self.snapshot is not None:
+            spec[self.context_key] = Unbounded(self._context_shape, dtype=self.dtype, device=spec.device)
+        return spec
 
     def __repr__(self) -> str:
         size = f"{self.map.action_dim} -> {self.map.actuation_dim}"
@@ -236,74 +210,40 @@ class ActionMapTransform(Transform):
 
     def _attach(self, *, may_place: bool = False) -> None:
         """Checks map against environment, if there is one by now, and reads what holds for all steps."""
-        parent = self.parent  # the environment with the transforms before this one
-        if parent is None:
+        env, front, ahead = surroundings(self)
+        if env is None:
             return
-        self.empty_cache()  # or the parent would be kept, and be pickled with this transform
         if self.forward_only:
             raise ValueError("a forward_only transform is for replay buffers, not for environments")
-        base, batch_dims = parent.base_env, len(parent.batch_size)
-        actuation_spec = _actuation_spec(parent.full_action_spec, self.actuation_key, self.map.actuation_dim)
-        self._low, self._high = _bounds(actuation_spec, batch_dims)
-        if self.actuation_key in base.full_action_spec.keys(True, True):
-            actuation_spec = base.full_action_spec[self.actuation_key]
-        self._executed_spec = Unbounded(
-            actuation_spec.shape[batch_dims:], dtype=actuation_spec.dtype, device=actuation_spec.device
-        )
+        base = env.base_env
+        self._attach_actuation(base, ahead)
         observation_spec = base.full_observation_spec
-        if taken := {self.context_key, self.executed_key} & set(observation_spec.keys(True, True)):
+        raw_keys = set(observation_spec.keys(True, True))
+        others = [transform for transform in ahead if not isinstance(transform, ContextSnapshot)]
+        if taken := {self.context_key, self.executed_key} & raw_keys.union(*(t.out_keys for t in others)):
             raise ValueError(
-                f"the environment has an observation {taken.pop()!r} of its own: choose another "
-                "context_key or executed_key"
+                f"there is another entry {taken.pop()!r} already: choose another context_key or executed_key"
             )
-        if self.snapshot is not None:
-            lead = actuation_spec.shape[:-1]
-            _check_context(observation_spec, self.snapshot.in_keys, lead, self.map.context_dim)
-            self._context_shape = (*lead, self.map.context_dim)
-            self._place_snapshot(self.snapshot, may_place)
-
-    def _place_snapshot(self, snapshot: ContextSnapshot, may_place: bool) -> None:
-        """Sees to it that the context is recorded before another transform can rewrite the observation."""
-        front, ahead = self._chain()
-        placed = [isinstance(t, ContextSnapshot) and t.out_keys == snapshot.out_keys for t in ahead]
-        others = [not isinstance(t, _READERS) for t in ahead]
-        self._takes_snapshot = not any(placed) and not any(others)
-        if front is None or not any(others):
+        if self.snapshot is None:
             return
-        first = others.index(True)
-        if any(placed[:first]):
-            return
-        if any(placed) or not may_place:
-            raise ValueError(
-                f"{type(ahead[first]).__name__} was put in front of the transform that records the raw context: "
-                "put it behind, or build the chain anew"
-            )
-        chain = list(front.transforms)
-        copied = snapshot.clone()
-        chain.insert(1 if isinstance(chain[0], VecGymEnvTransform) else 0, copied)
-        front.transforms = nn.ModuleList(chain)  # a new list, for the old one may just be iterated over
-        copied.set_container(front)
+        keys = self.snapshot.in_keys
+        made = set(keys) - raw_keys
+        if made and ahead:
+            check_writers(ahead, keys, made)
+            observation_spec = transformed_spec(base.output_spec, ahead, "output")["full_observation_spec"]
+        lead = self._context_shape[:-1]
+        check_context(observation_spec, keys, lead, self.map.context_dim)
+        self._takes_snapshot = bool(made) or not self.snapshot.put_in_front(front, ahead, may_place)
 
-    def _chain(self) -> tuple[Compose | None, list[Transform]]:
-        """The outermost Compose around this transform and, flat, all transforms that run before this one."""
-        front: Compose | None = None
-        ahead: list[Transform] = []
-        inner: Transform = self
-        while isinstance(outer := inner.__dict__["_container"](), Compose):
-            before = outer.transforms[: list(outer.transforms).index(inner)]
-            ahead[:0] = [leaf for transform in before for leaf in _leaves(transform)]
-            front = inner = outer
-        return front, ahead
-
-
-# These leave the observation as it is; VecGymEnvTransform is a part of TorchRL's vectorised Gym environments.
-_READERS = (ContextSnapshot, ActionMapTransform, VecGymEnvTransform)
-
-
-def _leaves(transform: Transform) -> list[Transform]:
-    if not isinstance(transform, Compose):
-        return [transform]
-    return [leaf for child in transform.transforms for leaf in _leaves(child)]
+    def _attach_actuation(self, base: EnvBase, ahead: list[Transform]) -> None:
+        action_spec = transformed_spec(base.input_spec, ahead, "input")["full_action_spec"]
+        spec = _actuation_spec(action_spec, self.actuation_key, self.map.actuation_dim)
+        batch_dims = len(base.batch_size)
+        self._low, self._high = _bounds(spec, batch_dims)
+        self._context_shape = torch.Size((*spec.shape[:-1], self.map.context_dim))
+        if self.actuation_key in base.full_action_spec.keys(True, True):
+            spec = base.full_action_spec[self.actuation_key]  # what other transforms make of it is executed
+        self._executed_spec = Unbounded(spec.shape[batch_dims:], dtype=spec.dtype, device=spec.device)
 
 
 def _resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> list[NestedKey]:
@@ -314,9 +254,9 @@ def _resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> 
                 f"context_keys must name the entries that make up the map's context of {map.context_dim}: "
                 "the map does not know them, as it was not trained on demonstrations"
             )
-        return own or []
+        return own if own and map.context_dim else []
     keys = [unravel_key(key) for key in ([given] if isinstance(given, str) else given)]
-    if own is not None and keys != own and sorted(map(str, keys)) == sorted(map(str, own)):
+    if own is not None and keys != own and set(keys) == set(own):
         raise ValueError(f"the map was trained on context_keys {own}, in this order; got {keys}")
     if bool(keys) != bool(map.context_dim):
         raise ValueError(f"the map's context has {map.context_dim} entries, got context_keys {keys}")
@@ -336,7 +276,7 @@ def _actuation_spec(action_spec: Composite, key: NestedKey, actuation_dim: int) 
     if key not in keys:
         raise KeyError(f"the environment has no action {key!r}; it has {keys}")
     spec = action_spec[key]
-    if not isinstance(spec.space, ContinuousBox) or not spec.dtype.is_floating_point:
+    if not spec.dtype.is_floating_point:
         raise TypeError(
             f"the environment's action {key!r} is not continuous: {type(spec).__name__} of {spec.dtype}"
         )
@@ -350,6 +290,9 @@ def _actuation_spec(action_spec: Composite, key: NestedKey, actuation_dim: int) 
 
 def _bounds(spec: TensorSpec, batch_dims: int) -> tuple[Tensor, Tensor]:
     """Low and high, infinite if there are none: one copy's, or, if the copies' bounds differ, those of all."""
+    if isinstance(spec, Stacked):
+        lows, highs = zip(*(_bounds(part, 0) for part in spec.unbind(spec.stack_dim)), strict=True)
+        return torch.stack(lows, spec.stack_dim), torch.stack(highs, spec.stack_dim)
     if isinstance(spec, Unbounded):
         high = torch.full(spec.shape[batch_dims:], torch.inf, dtype=spec.dtype, device=spec.device)
         return -high, high
@@ -358,29 +301,3 @@ def _bounds(spec: TensorSpec, batch_dims: int) -> tuple[Tensor, Tensor]:
     if low.equal(low[first].expand_as(low)) and high.equal(high[first].expand_as(high)):
         low, high = low[first], high[first]  # these fit any batch, such as that of a masked step
     return low.clone(), high.clone()
-
-
-def _check_context(
-    observation_spec: Composite, keys: Sequence[NestedKey], lead: torch.Size, context_dim: int
-) -> None:
-    """Every key is there, of floats, of shape (*lead, width), and the widths add up to the map's context."""
-    available = list(observation_spec.keys(True, True))
-    for key in keys:
-        if key not in available:
-            raise KeyError(
-                f"the environment's raw observation has no context key {key!r}; it has {available}"
-            )
-        spec = observation_spec[key]
-        if not spec.dtype.is_floating_point:
-            raise TypeError(f"context key {key!r} must be of floats, got {spec.dtype}")
-        if not spec.shape or spec.shape[:-1] != lead:
-            raise ValueError(
-                f"context key {key!r} must have the shape ({', '.join(map(str, [*lead, 'width']))}), "
-                f"as the actuation has, got {tuple(spec.shape)}"
-            )
-    widths = {key: observation_spec[key].shape[-1] for key in keys}
-    if sum(widths.values()) != context_dim:
-        sizes = ", ".join(f"{key!r}: {width}" for key, width in widths.items())
-        raise ValueError(
-            f"the map's context has {context_dim} entries, the context keys {sum(widths.values())} ({sizes})"
-        )
