@@ -81,6 +81,7 @@ def spectral(layer: nn.Module) -> float:
     return float(torch.linalg.matrix_norm(layer.weight, ord=2))
 
 
+@torch.no_grad()
 def test_frobenius_limits_are_stricter() -> None:
     map = wild(lipschitz=2.0, lipschitz_norm="frobenius")
     LipschitzProjection(map)
