@@ -35,6 +35,8 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(
                 f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}."
             )
+        # Gymnasium's rule: without a seed, every environment draws its own.
+        options.setdefault("seed", int(self.np_random.integers(2**31)))
         self.task = make_task(task, num_envs=1, **options)
         self.render_mode = render_mode
         low, high = (bound.astype(np.float32) for bound in self.task.actuation_bounds)

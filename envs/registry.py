@@ -19,6 +19,13 @@ EXPERTS: dict[str, type[Expert]] = {"wam_wipe": WipeExpert}
 """The scripted demonstrator of every task that has one."""
 
 
+class UnknownOptionError(ValueError, TypeError):
+    """An option that does not exist: a bad value to whoever wrote a configuration, a TypeError to Python.
+
+    TorchRL's ``GymEnv`` tries keywords of other environments and takes only Python's usual answer for a no.
+    """
+
+
 def make_task(name: str, **options: Any) -> BatchedTask:
     """Build the copies of a task.
 
@@ -74,5 +81,8 @@ def make_expert(name: str, **settings: Any) -> Expert:
 
 def _check_options(factory: type, options: dict[str, Any], name: str) -> None:
     known = list(inspect.signature(factory).parameters)
-    if unknown := sorted(set(options) - set(known)):
-        raise ValueError(f"{name} has no option {unknown}: its options are {known}.")
+    for option in options:
+        if option not in known:
+            raise UnknownOptionError(
+                f"{name} got an unexpected keyword argument {option!r}: its options are {known}."
+            )

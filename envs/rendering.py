@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import sys
+import weakref
 
 import mujoco
 import numpy as np
@@ -39,6 +41,8 @@ class SceneRenderer:
                 "offscreen rendering needs OpenGL: install EGL (Debian: libegl1 libgl1-mesa-dri), or OSMesa "
                 "(libosmesa6) and set MUJOCO_GL=osmesa before Python starts."
             ) from error
+        # At exit MuJoCo ends EGL; what the collector frees after that prints a traceback.
+        atexit.register(_close, weakref.ref(self._renderer))
 
     def frame(self, row: int = 0) -> NDArray[np.uint8]:
         """The copy ``row`` as it stands now, ``(height, width, 3)``."""
@@ -52,6 +56,11 @@ class SceneRenderer:
     def close(self) -> None:
         """Release the OpenGL context."""
         self._renderer.close()
+
+
+def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
+    if (still_there := renderer()) is not None:
+        still_there.close()
 
 
 def _prefer_offscreen_platform() -> None:

@@ -1,0 +1,199 @@
+"""Gymnasium's side of every task, and pictures of it."""
+
+import os
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from torchrl.envs import GymEnv
+from torchrl.envs.utils import check_env_specs
+
+from nht.envs import GYMNASIUM_IDS, make_env
+from nht.envs.wam import GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT
+from nht.envs.wam_kinematics import tool_pose
+
+DRAW = """
+import mujoco
+with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16) as renderer:
+    renderer.render()
+"""
+
+
+def run(code, **variables):
+    """Run ``code`` in another process, without a display and with nothing said about OpenGL but ``variables``."""
+    inherited = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL")}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=inherited | variables, capture_output=True, text=True, timeout=200)
+
+
+@pytest.fixture(scope="session")
+def can_render():
+    if all(run(DRAW, MUJOCO_GL=platform).returncode for platform in ("egl", "osmesa")):
+        pytest.skip("neither EGL nor OSMesa is installed")
+
+
+@pytest.fixture(params=sorted(GYMNASIUM_IDS))
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def env(name):
+    env = gymnasium.make(GYMNASIUM_IDS[name])
+    yield env
+    env.close()
+
+
+# What the checker only recommends: its authors like actions in [-1, 1] and bounded observations.
+@pytest.mark.filterwarnings("ignore:.*(symmetric and normalized space|value is -?infinity):UserWarning")
+@pytest.mark.filterwarnings("error")
+def test_passes_gymnasiums_checker(env):
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_spaces(name, env):
+    task = env.unwrapped.task
+    assert env.observation_space.dtype == env.action_space.dtype == np.float32
+    assert env.observation_space.shape == (task.observation_sizes["observation"],)
+    for bound, own in zip(task.actuation_bounds, (env.action_space.low, env.action_space.high), strict=True):
+        np.testing.assert_allclose(own, bound)
+
+
+def test_agrees_with_the_batched_environment(name):
+    single, batched = gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=None), make_env(name)
+    limit = single.unwrapped.task.max_episode_steps
+    single.action_space.seed(0)
+    observation, info = single.reset(seed=5)
+    batched.set_seed(5)
+    tensordict = batched.reset()
+    truncations = 0
+    for _ in range(limit + 5):
+        assert_same_state(observation, info, tensordict[0])
+        action = single.action_space.sample()
+        observation, reward, terminated, truncated, info = single.step(action)
+        frame, tensordict = batched.step_and_maybe_reset(tensordict.set("action", torch.tensor(action)[None]))
+        expected = frame["next"][0]
+        assert_same_state(observation, info, expected)
+        assert (reward, terminated, truncated) == tuple(
+            expected[key].item() for key in ("reward", "terminated", "truncated")
+        )
+        if terminated or truncated:
+            truncations += truncated
+            observation, info = single.reset()
+    assert truncations
+
+
+def assert_same_state(observation, info, expected):
+    values = info | {"observation": observation}
+    for key, value in values.items():
+        np.testing.assert_array_equal(np.atleast_1d(value), expected[key].numpy(), err_msg=key)
+    assert set(values) == set(expected.keys()) - {"action", "reward", "done", "terminated", "truncated"}
+
+
+def test_a_seed_repeats_and_no_seed_does_not(env):
+    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert not np.array_equal(env.reset()[0], other)
+    env_id = env.spec.id
+    unseeded = [gymnasium.make(env_id).reset()[0] for _ in range(2)]
+    assert not np.array_equal(*unseeded)
+
+
+def test_options_reach_the_task(name):
+    env = gymnasium.make(GYMNASIUM_IDS[name], seed=3)
+    seeded = gymnasium.make(GYMNASIUM_IDS[name], seed=3)
+    np.testing.assert_array_equal(env.reset()[0], seeded.reset()[0])
+    with pytest.raises(TypeError, match="unexpected keyword argument 'nonesuch'"):
+        gymnasium.make(GYMNASIUM_IDS[name], nonesuch=1)
+
+
+def test_works_through_torchrls_wrapper(name):
+    check_env_specs(GymEnv(GYMNASIUM_IDS[name]))
+
+
+@pytest.mark.filterwarnings("ignore:.*not in the possible render_modes:UserWarning")
+def test_unknown_render_mode(name):
+    with pytest.raises(ValueError, match=r"None or one of \['rgb_array'\], got 'ansi'"):
+        gymnasium.make(GYMNASIUM_IDS[name], render_mode="ansi")
+
+
+def test_without_a_render_mode_there_is_no_picture(env):
+    env.reset()
+    assert env.unwrapped.render() is None
+
+
+def test_closing_twice(env):
+    env.reset()
+    env.unwrapped.close()
+    env.unwrapped.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        env.step(env.action_space.sample())
+
+
+# Pictures.
+
+
+@pytest.mark.usefixtures("can_render")
+def test_pictures_show_what_moves(name):
+    env = gymnasium.make(GYMNASIUM_IDS[name], render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    kept = before.copy()
+    env.action_space.seed(0)
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    after = env.render()
+    env.close()
+    assert before.dtype == np.uint8
+    assert before.shape == (480, 640, 3)
+    assert before.std() > 10, "the picture is nearly empty"
+    assert (np.abs(after.astype(int) - before).max(axis=2) > 30).mean() > 1e-3
+    np.testing.assert_array_equal(before, kept)
+
+
+def marked(picture, colour):
+    """Centre (row, column) and number of the pixels of a hue near ``colour``."""
+    pixels = picture.astype(float)
+    away = np.linalg.norm(pixels / pixels.sum(axis=2, keepdims=True) - np.array(colour) / sum(colour), axis=2)
+    rows, columns = np.nonzero((away < 0.1) & (pixels.max(axis=2) > 100))
+    return np.array([rows.mean(), columns.mean()]), len(rows)
+
+
+@pytest.mark.usefixtures("can_render")
+def test_the_goal_is_seen_wherever_it_lies_in_the_colour_of_its_state():
+    env = gymnasium.make("nht/WAMWipe-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    task, orange, green, red = env.unwrapped.task, (0.95, 0.6, 0.1), (0.2, 0.7, 0.25), (0.85, 0.15, 0.15)
+    seen = {}
+    for x in (GOAL_LOW[0], GOAL_HIGH[0]):
+        for y in (GOAL_LOW[1], GOAL_HIGH[1]):
+            task.goal[0] = [x, y, TABLE_HEIGHT]
+            seen[x, y], size = marked(env.render(), orange)
+            assert size > 100
+    # The camera looks back at the arm: x comes nearer (down the picture), y goes to the right.
+    assert all(seen[GOAL_HIGH[0], y][0] > seen[GOAL_LOW[0], y][0] + 30 for y in (GOAL_LOW[1], GOAL_HIGH[1]))
+    assert all(seen[x, GOAL_HIGH[1]][1] > seen[x, GOAL_LOW[1]][1] + 100 for x in (GOAL_LOW[0], GOAL_HIGH[0]))
+
+    task.goal[0] = tool_pose(START_POSTURE[None])[0][0] + np.array([0.028, 0, 0])
+    assert marked(env.render(), green)[1] > 20
+    task.failed[0] = True
+    assert marked(env.render(), red)[1] > 20
+    env.close()
+
+
+@pytest.mark.usefixtures("can_render")
+def test_renders_without_a_display_though_torchrl_imported_mujoco_first():
+    result = run("""
+import torchrl.envs, mujoco
+import gymnasium, nht.envs
+env = gymnasium.make("nht/WAMWipe-v0", render_mode="rgb_array")
+env.reset(seed=0)
+print(env.render().std() > 10)
+""")
+    assert result.stdout.split() == ["True"], result.stderr
+    assert "Exception ignored" not in result.stderr, "the environment was not closed: a traceback at exit"
