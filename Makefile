@@ -53,10 +53,10 @@ test-slow: setup ## The slow tests: learning, processes, compilation
 	$(BIN)/pytest -m slow
 
 demo: setup ## The main job: demonstrations, map, DDPG through it and on raw joints, table, plot and videos
-	@OMP_NUM_THREADS=1 recipes/demo.sh $(BIN)/python
+	@OMP_NUM_THREADS=1 ./demo.sh $(BIN)/python
 
-bench: setup ## Run every benchmarks/bench_*.py
-	@for file in benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
+bench: setup ## Measure speed and what the maps can do; the learning runs are in benchmarks/README.md
+	@for file in benchmarks/*.py; do echo "== $$file"; OMP_NUM_THREADS=1 $(BIN)/python "$$file"; done
 
 clean: ## Remove what building and the tools left; .venv and runs/ stay
 	rm -rf build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,5 +1,7 @@
 """Learned action interfaces: from low-dimensional actions, in a context, to the actuation of the motors."""
 
+from importlib.metadata import version
+
 from nht.demos import Demos, load_demos, save_demos
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
@@ -22,3 +24,5 @@ __all__ = [
     "save_map",
     "train_map",
 ]
+
+__version__ = version("nht")

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from torchrl.envs import TransformedEnv
+
 import nht
 from nht.recipes.config import DDPG, Evaluate
 from nht.recipes.environments import mapped_env
@@ -26,7 +28,7 @@ def main(config: Evaluate) -> None:
     )
     map = nht.load_map(folder / "map.safetensors")
 
-    def build(copies: int):
+    def build(copies: int) -> TransformedEnv:
         return mapped_env(env, map, trained.map.action_scale, seed=config.seed, num_envs=copies)
 
     tests = build(config.episodes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -75,12 +76,12 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
     frames_per_second = round(1 / (task.substeps * task.model.opt.timestep))
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with imageio.get_writer(path, fps=frames_per_second, macro_block_size=8) as video:
+        with imageio.get_writer(path, fps=frames_per_second, macro_block_size=8) as writer:
+            video: Any = writer  # its stub lacks append_data
 
             def film() -> None:
-                video.append_data(
-                    np.concatenate([renderer.frame(row) for row in range(task.num_envs)], axis=1)
-                )
+                rows = [renderer.frame(row) for row in range(task.num_envs)]
+                video.append_data(np.concatenate(rows, axis=1))
 
             return evaluate(env, policy, on_step=film)
     finally:

@@ -31,6 +31,8 @@ class RunningNorm(nn.Module):
     count: Tensor
     mean: Tensor
     squares: Tensor
+    shift: Tensor
+    scale: Tensor
 
     def __init__(self, size: int, clip: float = 5.0, floor: float = 0.01) -> None:
         super().__init__()

@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict
 from netrc import NetrcParseError, netrc
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, cast
 
 import pandas
 import wandb
@@ -107,7 +107,8 @@ def read_config(folder: Path, schema: type[Config]) -> Config:
     settings = folder / "config.yaml"
     if not settings.exists():
         raise FileNotFoundError(f"{folder} holds no run: it has no config.yaml.")
-    return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(settings)))
+    merged = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(settings))
+    return cast(Config, OmegaConf.to_object(merged))
 
 
 def _logged_in() -> bool:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import cast
 
 from tqdm import tqdm
 
 import nht
+from nht.maps import Activation
 from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
 from nht.recipes.launch import launch
@@ -75,7 +77,7 @@ def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) ->
             actuation_dim,
             map.action_dim,
             hidden=tuple(map.hidden),
-            activation=map.activation,
+            activation=cast(Activation, map.activation),
             lipschitz=map.lipschitz,
             seed=seed,
         )

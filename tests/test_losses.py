@@ -1,0 +1,102 @@
+"""What the recipes add to TorchRL's DDPG, against values worked out by hand."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from nht.recipes.losses import PaperDDPGLoss, charge_failure, lowest_return
+from nht.recipes.networks import RunningNorm
+
+GAMMA = 0.9
+
+
+class Linear(nn.Module):
+    """Sum of all inputs times a weight, plus a bias."""
+
+    def __init__(self, weight: float, bias: float) -> None:
+        super().__init__()
+        self.weight, self.bias = nn.Parameter(torch.tensor(weight)), nn.Parameter(torch.tensor(bias))
+
+    def forward(self, *inputs):
+        return self.weight * torch.cat(inputs, -1).sum(-1, keepdim=True) + self.bias
+
+
+def loss(critic_bias=0.0, action_l2=0.0):
+    actor = TensorDictModule(Linear(0.5, 0.0), in_keys=["features"], out_keys=["action"])
+    critic = TensorDictModule(
+        Linear(1.0, critic_bias), in_keys=["features", "action"], out_keys=["state_action_value"]
+    )
+    return PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=action_l2)
+
+
+def batch(features, action, next_features, reward, terminated=False):
+    flag = torch.tensor([[terminated]])
+    column = {key: torch.tensor([[value]]) for key, value in [("features", features), ("action", action)]}
+    outcome = {"features": torch.tensor([[next_features]]), "reward": torch.tensor([[reward]])}
+    outcome |= {"done": flag, "terminated": flag.clone()}
+    return TensorDict({**column, "next": outcome}, batch_size=[1])
+
+
+def test_target_is_reward_plus_discounted_target_value():
+    # next action = 0.5 * -2 = -1, next value = -2 - 1 = -3, target = -1 + 0.9 * -3 = -3.7; value = 1 + 0.5 = 1.5
+    losses = loss()(batch(1.0, 0.5, -2.0, -1.0))
+    assert losses["target_value"].item() == pytest.approx(-3.7)
+    assert losses["loss_value"].item() == pytest.approx((1.5 + 3.7) ** 2)
+
+
+def test_termination_stops_the_bootstrap_and_truncation_does_not():
+    assert loss()(batch(1.0, 0.5, -2.0, -1.0, terminated=True))["target_value"].item() == -1.0
+    truncated = batch(1.0, 0.5, -2.0, -1.0)
+    truncated["next", "done"] = torch.ones(1, 1, dtype=torch.bool)
+    assert loss()(truncated)["target_value"].item() == pytest.approx(-3.7)
+
+
+def test_targets_stay_within_the_returns_that_are_possible():
+    assert loss(critic_bias=100.0)(batch(1.0, 0.5, 1.0, -1.0))["target_value"].item() == 0.0
+    assert loss(critic_bias=-100.0)(batch(1.0, 0.5, 1.0, -1.0))["target_value"].item() == pytest.approx(-10.0)
+
+
+def test_actor_pays_for_large_actions_and_leaves_the_critic_alone():
+    # action = 0.5 * 2 = 1, value = 2 + 1 = 3
+    module = loss(action_l2=0.25)
+    value, _ = module.loss_actor(batch(2.0, 0.0, 0.0, -1.0))
+    assert value.item() == pytest.approx(0.25 - 3.0)
+    value.backward()
+    gradients = {name: parameter.grad for name, parameter in module.named_parameters()}
+    assert all((gradient is not None) == ("actor" in name) for name, gradient in gradients.items())
+
+
+def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
+    flags = torch.tensor([[True, True], [True, False], [False, True], [False, False]])
+    steps = TensorDict(
+        {
+            "next": {
+                "reward": -torch.ones(4, 1),
+                "failure": flags[:, :1],
+                "terminated": flags[:, 1:],
+            }
+        },
+        batch_size=[4],
+    )
+    charged = charge_failure(steps, GAMMA)["next", "reward"].squeeze(-1)
+    assert lowest_return(GAMMA) == pytest.approx(-10.0)
+    assert charged.tolist() == pytest.approx([-10.0, -1.0, -1.0, -1.0])
+
+
+def test_running_norm_equals_the_mean_and_deviation_of_all_it_saw():
+    generator = torch.Generator().manual_seed(0)
+    rows = 3.0 + 2.0 * torch.randn(500, 4, generator=generator, dtype=torch.float64)
+    norm = RunningNorm(4)
+    for part in rows.split([1, 99, 150, 250]):
+        norm.update(part)
+    torch.testing.assert_close(norm.shift, rows.mean(0).float())
+    torch.testing.assert_close(norm.scale, rows.std(0, correction=0).float())
+    assert norm(torch.full((2, 4), 1e6)).max() == 5.0
+
+
+def test_running_norm_does_not_divide_by_a_vanishing_deviation():
+    norm = RunningNorm(1)
+    norm.update(torch.full((10, 1), 2.0))
+    torch.testing.assert_close(norm(torch.tensor([[2.005]])), torch.tensor([[0.5]]), atol=1e-4, rtol=0)
