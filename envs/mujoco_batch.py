@@ -71,6 +71,10 @@ class BatchedMujocoEnv(EnvBase):
         reward = self._tensor(outcome.reward[:, None].astype(np.float32))
         return self._pack(self._observations() | entries | {"reward": reward})
 
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        # TorchRL would look for missing flags and wrong shapes: `_step` writes all of them, and right.
+        return next_tensordict_out
+
     def _observations(self) -> dict[str, torch.Tensor]:
         return {key: self._tensor(values.astype(np.float32)) for key, values in self.task.observe().items()}
 

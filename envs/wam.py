@@ -163,7 +163,8 @@ class WAMWipe(BatchedTask):
         off_table = np.abs(self._position[:, 2] - TABLE_HEIGHT) > self.height_tolerance
         tilted = self._normal[:, 2] > -math.cos(self.tilt_tolerance)
         self.failed |= off_table | tilted
-        near = np.linalg.norm(self._position - self.goal, axis=1) < self.success_radius
+        to_goal = self.goal - self._position
+        near = np.einsum("ij,ij->i", to_goal, to_goal) < self.success_radius**2
         success = near & ~self.failed
         ended = (self.failed & self.terminate_on_failure) | (success & self.terminate_on_success)
         return success - 1.0, ended, success, self.failed.copy()
