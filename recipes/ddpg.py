@@ -87,7 +87,7 @@ def main(config: DDPG) -> None:
     for data in collector:
         data = charge_failure(data.reshape(-1), algo.gamma)
         features.module.update(data["observation"])
-        buffer.extend(data.select(*STORED))
+        buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
         counters.frames += data.numel()
         training.add_steps(data)
 
@@ -114,6 +114,7 @@ def main(config: DDPG) -> None:
         if counters.frames >= algo.total_frames:
             break
     collector.shutdown()
+    tests.close()
     progress.close()
     save_policy(policy, run.path)
     if config.evaluation.video:
