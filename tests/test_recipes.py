@@ -115,6 +115,12 @@ def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
     assert nht.load_map(tmp_path / "map.safetensors").action_dim == policy_size
 
 
+def test_the_papers_settings_run(map_file, tmp_path):
+    metrics = train(tmp_path / "run", map_file, "algo=ddpg_paper", "algo.updates_per_batch=45")
+    assert metrics["updates"].tolist() == [4 * 45, 9 * 45]
+    assert metrics["loss_value"].notna().all()
+
+
 def test_wandb_works_offline_and_gets_video_and_map(map_file, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     overrides = ["run.wandb=true", "evaluation.video=true", "algo.total_frames=1000"]
