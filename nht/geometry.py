@@ -1,7 +1,7 @@
 """Householder geometry: from tangent vectors to an orthonormal frame, as pure functions of tensors.
 
-Equation numbers are those of "Contextual Subspace Approximation with Neural Householder Transforms"
-(ICLR 2023). With k unit vectors v_1 ... v_k in R^n, Q = H(v_1) ... H(v_k) is an orthogonal n x n matrix (Eq.
+Equation numbers are those of "Contextual Subspace Approximation with Neural Householder Transforms".
+With k unit vectors v_1 ... v_k in R^n, Q = H(v_1) ... H(v_k) is an orthogonal n x n matrix (Eq.
 8) and its first k columns are the basis (Eq. 7). No function here forms an n x n matrix: a reflection costs
 one dot product and one addition.
 """
