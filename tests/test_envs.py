@@ -6,6 +6,7 @@ A new task adds two entries: its first steps to GOLDEN, and what never changes i
 import inspect
 import math
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -110,6 +111,14 @@ def test_flags_agree(name):
     assert data["reward"].isfinite().all()
 
 
+def test_actuation_is_clipped_to_its_bounds(name):
+    env, wild = make_env(name, num_envs=2), make_env(name, num_envs=2)
+    low, high = (torch.tensor(bound, dtype=torch.float32) for bound in env.task.actuation_bounds)
+    for within, beyond in [(high, high + 100), (low, low - 100)]:
+        data, other = (play(each, bound.expand(3, 2, -1)) for each, bound in [(env, within), (wild, beyond)])
+        assert_same(data["next"], other["next"])
+
+
 def test_golden_first_steps(name):
     env = make_env(name, num_envs=2)
     env.set_seed(0)
@@ -170,7 +179,7 @@ def test_goes_on_from_a_saved_state(name):
     env = make_env(name, num_envs=3, max_episode_steps=8)
     actions = random_actions(env, 30)
     play(env, actions[:5])
-    saved = pickle.dumps(env.task.state_dict())
+    saved, observed = pickle.dumps(env.task.state_dict()), env.task.observe()
     expected = play(env, actions, env.fake_tensordict())["next"]
     assert expected["done"].any()
 
@@ -178,6 +187,8 @@ def test_goes_on_from_a_saved_state(name):
     for resumed in (env, fresh):
         state = pickle.loads(saved)
         resumed.task.load_state_dict(state)
+        for key, values in resumed.task.observe().items():
+            np.testing.assert_array_equal(values, observed[key])
         assert_same(play(resumed, actions, resumed.fake_tensordict())["next"], expected)
         assert pickle.dumps(state) == saved, "the saved state was written to"
 
@@ -249,6 +260,18 @@ def test_returned_tensors_belong_to_the_caller(name):
     assert_same(torch.stack(frames), torch.stack([copy["next"] for _, copy in kept]))
 
 
+def test_returned_arrays_belong_to_the_caller(name):
+    task = make_env(name, num_envs=3).task
+    actuation = random_actions(make_env(name, num_envs=3), 1)[0].numpy()
+    outcome = task.step(actuation)
+    kept = task.observe() | vars(outcome)
+    copies = {key: values.copy() for key, values in kept.items()}
+    task.step(-actuation)
+    task.reset()
+    for key, values in kept.items():
+        np.testing.assert_array_equal(values, copies[key], err_msg=key)
+
+
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_an_action_that_is_not_finite_fails_its_copy_only(name, value):
     env, healthy = make_env(name, num_envs=3), make_env(name, num_envs=3)
@@ -257,6 +280,7 @@ def test_an_action_that_is_not_finite_fails_its_copy_only(name, value):
     actions[2, 1, -1] = value
     data = play(env, actions)
     assert_one_copy_failed(data, expected, row=1, step=2)
+    assert not Path("MUJOCO_LOG.TXT").exists(), "it reached the simulation"
 
 
 @pytest.mark.parametrize("num_threads", [1, 2])
@@ -269,6 +293,14 @@ def test_diverged_physics_fails_its_copy_only(name, num_threads):
     env.task.qvel[0] = 1e12
     after = play(env, actions[2:], env.fake_tensordict())
     assert_one_copy_failed(torch.cat([before, after]), expected, row=0, step=2)
+
+
+def test_a_diverged_copy_stays_where_it_was(name):
+    env = make_env(name, num_envs=2)
+    env.task.qpos[0] = 1e12
+    for action in random_actions(env, 2):
+        assert env.task.step(action.numpy()).diverged.tolist() == [True, False]
+        assert (env.task.qpos[0] == 1e12).all()
 
 
 def assert_one_copy_failed(data, expected, row, step):

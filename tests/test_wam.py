@@ -273,6 +273,14 @@ def test_terminate_on_success():
     assert outcome.terminated.tolist() == outcome.success.tolist() == [True, False]
 
 
+def test_an_action_that_is_not_finite_is_no_success():
+    task = make_wipe(2)
+    at_goal(task)
+    outcome = task.step(np.array([np.full(7, np.nan), STILL]))
+    assert outcome.success.tolist() == [False, True]
+    assert outcome.failure.tolist() == [True, False]
+
+
 def test_goals_lie_in_their_area_and_differ():
     task = make_wipe(500)
     goals = task.goal.copy()
@@ -311,9 +319,16 @@ def test_random_starts_are_flush_and_swivelled(swivel_range):
     assert not step(task).failure.any()
 
 
-def test_a_posture_that_cannot_be_is_not_found():
-    target = np.array([AT, [2.0, 0.0, TABLE_HEIGHT]])
-    assert flush_posture(target, np.zeros(2))[1].tolist() == [True, False]
+def test_flush_postures_that_are_found_are_exact_and_free_to_move():
+    rng = np.random.default_rng(0)
+    target = np.column_stack([rng.uniform([0.2, -0.8], [1.0, 0.8], (500, 2)), np.full(500, TABLE_HEIGHT)])
+    posture, found = flush_posture(target, rng.uniform(-0.5, 0.5, 500))
+    position, normal = tool_pose(posture)
+    exact = (np.linalg.norm(position - target, axis=1) < 1e-5) & (normal @ DOWN > 1 - 1e-6)
+    free = (brake(posture, np.full(7, 1.0)) * brake(posture, np.full(7, -1.0))).all(axis=1)
+    np.testing.assert_array_equal(found, exact & free)
+    assert (exact & ~free).any(), "the limits did not matter"
+    assert (free & ~exact).any(), "reach did not matter"
 
 
 @pytest.mark.parametrize(
@@ -364,6 +379,18 @@ def test_expert_stays_at_the_goal():
     assert outcome.truncated.all()
     assert outcome.success.all()
     assert np.linalg.norm(tool_pose(task.qpos)[0] - task.goal, axis=1).max() < 0.005
+
+
+def test_expert_drives_out_errors_of_height_and_tilt():
+    task, expert = make_wipe(), make_expert("wam_wipe")
+    at_goal(task, 0.1)
+    task.qpos[:] = posture_at(AT + 0.01 * Z, math.cos(0.1) * DOWN + math.sin(0.1) * X)
+    step(task)
+    for _ in range(100):
+        task.step(expert(task.observe()))
+    (position,), (normal,) = tool_pose(task.qpos)
+    np.testing.assert_allclose(position, task.goal[0], atol=1e-4)
+    np.testing.assert_allclose(normal, DOWN, atol=1e-4)
 
 
 def test_slow_expert_takes_the_papers_250_steps():
