@@ -5,11 +5,13 @@ from importlib.metadata import version
 from nht.demos import Demos, load_demos, save_demos
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
+from nht.scl import SCL
 from nht.storage import load_map, save_map
 from nht.train import MapTraining, projection_error, train_map
 
 __all__ = [
     "NHT",
+    "SCL",
     "SVD",
     "ActionMap",
     "Demos",

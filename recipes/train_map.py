@@ -17,7 +17,12 @@ from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
 from nht.recipes.launch import launch
 
-KINDS: dict[str, type[nht.ActionMap]] = {"nht": nht.NHT, "svd": nht.SVD, "none": nht.Identity}
+KINDS: dict[str, type[nht.ActionMap]] = {
+    "nht": nht.NHT,
+    "scl": nht.SCL,
+    "svd": nht.SVD,
+    "none": nht.Identity,
+}
 """Every kind of map by the name that configurations use."""
 
 
@@ -71,8 +76,9 @@ def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) ->
     Raises:
         ValueError: for an unknown kind; the message lists those that exist.
     """
-    if map.kind == "nht":
-        return nht.NHT(
+    if map.kind in ("nht", "scl"):
+        learned = nht.NHT if map.kind == "nht" else nht.SCL
+        return learned(
             context_dim,
             actuation_dim,
             map.action_dim,

@@ -101,7 +101,7 @@ def test_stopping_and_resuming_equals_going_on(run, map_file, tmp_path):
     assert (resumed / "policy.safetensors").read_bytes() == (folder / "policy.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["svd", "none"])
+@pytest.mark.parametrize("kind", ["scl", "svd", "none"])
 def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
     overrides = [
         *TINY,
@@ -109,9 +109,11 @@ def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
         f"demos.path={demos}",
         f"run.folder={tmp_path}",
         "algo.total_frames=1000",
+        "map.max_steps=250",
+        "map.hidden=[16]",
     ]
     ddpg.main(configure(DDPG, "ddpg", overrides))
-    policy_size = {"svd": 2, "none": 7}[kind]
+    policy_size = {"scl": 2, "svd": 2, "none": 7}[kind]
     assert nht.load_map(tmp_path / "map.safetensors").action_dim == policy_size
 
 

@@ -46,6 +46,7 @@ def trained(map: ActionMap) -> ActionMap:
 MAPS: dict[str, Callable[[], ActionMap]] = {
     "nht": lambda: nht.NHT(10, 7, 2, (16, 8), "sigmoid", normalise=True, lipschitz=4.0, seed=3),
     "double": lambda: nht.NHT(10, 7, 3, hidden=()).double(),
+    "scl": lambda: nht.SCL(10, 7, 2, (16, 8), "relu", lipschitz=4.0),
     "svd": lambda: nht.SVD(7, 2, 10),
     "identity": lambda: nht.Identity(7),
     "own": lambda: ScaledIdentity(7, 0.5),
