@@ -3,6 +3,7 @@
 from importlib.metadata import version
 
 from nht.demos import Demos, load_demos, save_demos
+from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
 from nht.scl import SCL
@@ -10,6 +11,8 @@ from nht.storage import load_map, save_map
 from nht.train import MapTraining, projection_error, train_map
 
 __all__ = [
+    "CAE",
+    "LASER",
     "NHT",
     "SCL",
     "SVD",

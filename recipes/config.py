@@ -34,7 +34,7 @@ class DemosConfig:
 class MapConfig:
     """Which action map, and how it is trained."""
 
-    kind: str = "nht"  # nht, scl, svd or none (raw actuation)
+    kind: str = "nht"  # nht, scl, laser, cae, svd or none (raw actuation)
     file: str | None = None  # a saved map; None trains one from the demonstrations
     action_dim: int = 2
     hidden: list[int] = field(default_factory=lambda: [256, 256])
@@ -43,6 +43,8 @@ class MapConfig:
     learning_rate: float = 1e-3
     batch_size: int = 256
     max_steps: int = 6_000
+    beta_kl: float = 1e-3  # laser: weight of the KL divergence of its latents
+    beta_dynamics: float = 1e-3  # laser: weight of predicting the next context
     action_scale: float | None = 1.0  # actuation per unit of action; None takes the demonstrations' largest
 
 

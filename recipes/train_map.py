@@ -20,6 +20,8 @@ from nht.recipes.launch import launch
 KINDS: dict[str, type[nht.ActionMap]] = {
     "nht": nht.NHT,
     "scl": nht.SCL,
+    "laser": nht.LASER,
+    "cae": nht.CAE,
     "svd": nht.SVD,
     "none": nht.Identity,
 }
@@ -74,23 +76,23 @@ def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) ->
     """The untrained map of a kind.
 
     Raises:
-        ValueError: for an unknown kind; the message lists those that exist.
+        ValueError: for an unknown kind; the message lists those that exist. For a Lipschitz limit that the kind
+            cannot keep to.
     """
-    if map.kind in ("nht", "scl"):
-        learned = nht.NHT if map.kind == "nht" else nht.SCL
-        return learned(
-            context_dim,
-            actuation_dim,
-            map.action_dim,
-            hidden=tuple(map.hidden),
-            activation=cast(Activation, map.activation),
-            lipschitz=map.lipschitz,
-            seed=seed,
-        )
+    _check_kind(map.kind)
+    if map.kind == "none":
+        return nht.Identity(actuation_dim, context_dim=context_dim)
     if map.kind == "svd":
         return nht.SVD(actuation_dim, map.action_dim, context_dim=context_dim)
-    _check_kind(map.kind)
-    return nht.Identity(actuation_dim, context_dim=context_dim)
+    sizes = (context_dim, actuation_dim, map.action_dim, map.hidden, cast(Activation, map.activation))
+    if map.lipschitz is not None and map.kind in ("laser", "cae"):
+        raise ValueError(f"map.lipschitz limits nht and scl, there is no limit for {map.kind!r}.")
+    if map.kind == "laser":
+        return nht.LASER(*sizes, beta_kl=map.beta_kl, beta_dynamics=map.beta_dynamics, seed=seed)
+    if map.kind == "cae":
+        return nht.CAE(*sizes, seed=seed)
+    linear = nht.SCL if map.kind == "scl" else nht.NHT
+    return linear(*sizes, lipschitz=map.lipschitz, seed=seed)
 
 
 def load_kind(path: str | Path, kind: str) -> nht.ActionMap:

@@ -101,7 +101,7 @@ def test_stopping_and_resuming_equals_going_on(run, map_file, tmp_path):
     assert (resumed / "policy.safetensors").read_bytes() == (folder / "policy.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["scl", "svd", "none"])
+@pytest.mark.parametrize("kind", ["scl", "laser", "cae", "svd", "none"])
 def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
     overrides = [
         *TINY,
@@ -113,7 +113,7 @@ def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
         "map.hidden=[16]",
     ]
     ddpg.main(configure(DDPG, "ddpg", overrides))
-    policy_size = {"scl": 2, "svd": 2, "none": 7}[kind]
+    policy_size = 7 if kind == "none" else 2
     assert nht.load_map(tmp_path / "map.safetensors").action_dim == policy_size
 
 
