@@ -3,6 +3,7 @@
 from importlib.metadata import version
 
 from nht.demos import Demos, load_demos, save_demos
+from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
@@ -19,6 +20,7 @@ __all__ = [
     "ActionMap",
     "Demos",
     "Identity",
+    "JacobianPinv",
     "LinearActionMap",
     "MapTraining",
     "certificate",

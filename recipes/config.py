@@ -34,7 +34,7 @@ class DemosConfig:
 class MapConfig:
     """Which action map, and how it is trained."""
 
-    kind: str = "nht"  # nht, scl, laser, cae, svd or none (raw actuation)
+    kind: str = "nht"  # nht, scl, laser, cae, svd, jacobian or none (raw actuation)
     file: str | None = None  # a saved map; None trains one from the demonstrations
     action_dim: int = 2
     hidden: list[int] = field(default_factory=lambda: [256, 256])

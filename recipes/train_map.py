@@ -5,6 +5,7 @@ python -m nht.recipes.train_map map=nht demos.path=runs/demos-wam_wipe
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
@@ -12,6 +13,7 @@ from typing import cast
 from tqdm import tqdm
 
 import nht
+from nht.envs import wam_kinematics
 from nht.maps import Activation
 from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
@@ -23,9 +25,13 @@ KINDS: dict[str, type[nht.ActionMap]] = {
     "laser": nht.LASER,
     "cae": nht.CAE,
     "svd": nht.SVD,
+    "jacobian": nht.JacobianPinv,
     "none": nht.Identity,
 }
 """Every kind of map by the name that configurations use."""
+
+ARMS = {"wam_wipe": wam_kinematics, "wam_grasp": wam_kinematics}
+"""The kinematics of every task that is done by an arm with known ones."""
 
 
 def main(config: TrainMap) -> None:
@@ -62,7 +68,7 @@ def train_map(
 
             return nht.train_map(
                 data,
-                make_map(map, context_dim, data.actuation.shape[-1], seed).to(device),
+                make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device),
                 context_keys=env.context_keys,
                 batch_size=map.batch_size,
                 learning_rate=map.learning_rate,
@@ -72,18 +78,29 @@ def train_map(
             )
 
 
-def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) -> nht.ActionMap:
+def make_map(
+    map: MapConfig, context_dim: int, actuation_dim: int, seed: int, env: EnvConfig | None = None
+) -> nht.ActionMap:
     """The untrained map of a kind.
+
+    Args:
+        map: which kind, and its options.
+        context_dim: width of the context.
+        actuation_dim: n.
+        seed: of the initial weights.
+        env: the task; only the kind "jacobian" asks what arm it has.
 
     Raises:
         ValueError: for an unknown kind; the message lists those that exist. For a Lipschitz limit that the kind
-            cannot keep to.
+            cannot keep to, or a Jacobian where there is no arm.
     """
     _check_kind(map.kind)
     if map.kind == "none":
         return nht.Identity(actuation_dim, context_dim=context_dim)
     if map.kind == "svd":
         return nht.SVD(actuation_dim, map.action_dim, context_dim=context_dim)
+    if map.kind == "jacobian":
+        return _jacobian(env or EnvConfig(name="unknown"))
     sizes = (context_dim, actuation_dim, map.action_dim, map.hidden, cast(Activation, map.activation))
     if map.lipschitz is not None and map.kind in ("laser", "cae"):
         raise ValueError(f"map.lipschitz limits nht and scl, there is no limit for {map.kind!r}.")
@@ -93,6 +110,19 @@ def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) ->
         return nht.CAE(*sizes, seed=seed)
     linear = nht.SCL if map.kind == "scl" else nht.NHT
     return linear(*sizes, lipschitz=map.lipschitz, seed=seed)
+
+
+def _jacobian(env: EnvConfig) -> nht.JacobianPinv:
+    if env.name not in ARMS:
+        raise ValueError(
+            f"map.kind 'jacobian' needs an arm's kinematics: {sorted(ARMS)} have one, {env.name!r} does not."
+        )
+    if env.context_keys != ["joint_angle"]:
+        raise ValueError(
+            f"map.kind 'jacobian' needs env.context_keys=[joint_angle], as map=jacobian sets, got {env.context_keys}."
+        )
+    arm = ARMS[env.name]
+    return nht.JacobianPinv(arm.A.tolist(), (arm.QUARTER_TURNS * math.pi / 2).tolist(), arm.D.tolist())
 
 
 def load_kind(path: str | Path, kind: str) -> nht.ActionMap:

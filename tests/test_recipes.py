@@ -101,7 +101,7 @@ def test_stopping_and_resuming_equals_going_on(run, map_file, tmp_path):
     assert (resumed / "policy.safetensors").read_bytes() == (folder / "policy.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["scl", "laser", "cae", "svd", "none"])
+@pytest.mark.parametrize("kind", ["scl", "laser", "cae", "svd", "jacobian", "none"])
 def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
     overrides = [
         *TINY,
@@ -113,7 +113,7 @@ def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
         "map.hidden=[16]",
     ]
     ddpg.main(configure(DDPG, "ddpg", overrides))
-    policy_size = 7 if kind == "none" else 2
+    policy_size = {"none": 7, "jacobian": 6}.get(kind, 2)
     assert nht.load_map(tmp_path / "map.safetensors").action_dim == policy_size
 
 
@@ -210,6 +210,25 @@ def test_demonstrations_of_another_env(demos, tmp_path):
     manifest.write_text(manifest.read_text().replace('"env": "wam_wipe"', '"env": "cheetah"'))
     with pytest.raises(ValueError, match=r"of env 'cheetah', expected 'wam_wipe'"):
         train_map.main(configure(TrainMap, "train_map", [f"demos.path={tmp_path / 'demos'}", "out=unused"]))
+
+
+def test_a_jacobian_without_an_arm():
+    config = configure(TrainMap, "train_map", ["map=jacobian", "out=unused"])
+    assert config.env.context_keys == ["joint_angle"]
+    cheetah = replace(config.env, name="half_cheetah")
+    with pytest.raises(
+        ValueError, match=r"kinematics: \['wam_grasp', 'wam_wipe'\] have one, 'half_cheetah' does not"
+    ):
+        train_map.make_map(config.map, 17, 6, 0, cheetah)
+    wide = replace(config.env, context_keys=["tool_position", "joint_angle"])
+    with pytest.raises(ValueError, match=r"needs env.context_keys=\[joint_angle\].*'tool_position'"):
+        train_map.make_map(config.map, 10, 7, 0, wide)
+
+
+def test_a_lipschitz_limit_for_a_map_that_has_none():
+    config = configure(TrainMap, "train_map", ["map=laser", "map.lipschitz=2", "out=unused"])
+    with pytest.raises(ValueError, match=r"map.lipschitz limits nht and scl, there is no limit for 'laser'"):
+        train_map.make_map(config.map, 10, 7, 0)
 
 
 def test_an_unknown_option_of_the_task(tmp_path):
