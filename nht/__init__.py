@@ -7,6 +7,7 @@ from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
+from nht.residual import Residual
 from nht.scl import SCL
 from nht.storage import load_map, save_map
 from nht.train import MapTraining, projection_error, train_map
@@ -23,6 +24,7 @@ __all__ = [
     "JacobianPinv",
     "LinearActionMap",
     "MapTraining",
+    "Residual",
     "certificate",
     "load_demos",
     "load_map",

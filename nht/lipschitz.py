@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap
+from nht.residual import Residual
 
 ROUNDING = 1e-6  # a limit is undercut by this share, lest rounding a scaled matrix to float32 exceed it
 
@@ -26,9 +27,12 @@ def certificate(map: ActionMap) -> float:
     training kept to a limit or not.
 
     Returns:
-        0 for a basis that ignores the context; infinity where none is known, as for a map that is not linear
+        Of a Residual the constant of the map inside, as corrections do not depend on the context. 0 for a basis
+        that ignores the context; infinity where none is known, as for a map that is not linear
         in the action.
     """
+    if isinstance(map, Residual):
+        return certificate(map.map)
     if not isinstance(map, LinearActionMap):
         return math.inf
     if map.network is None:

@@ -45,7 +45,15 @@ class MapConfig:
     max_steps: int = 6_000
     beta_kl: float = 1e-3  # laser: weight of the KL divergence of its latents
     beta_dynamics: float = 1e-3  # laser: weight of predicting the next context
+    residual: float | None = None  # adds n corrections to the action, each worth this much actuation
     action_scale: float | None = 1.0  # actuation per unit of action; None takes the demonstrations' largest
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for corrections without a positive size."""
+        if self.residual is not None and not self.residual > 0:
+            raise ValueError(
+                f"map.residual must be positive, or null for no corrections, got {self.residual}."
+            )
 
 
 @dataclass

@@ -66,7 +66,7 @@ def train_map(
                 bar.set_postfix(error=f"{metrics['validation_error']:.2e}", refresh=False)
                 bar.update(int(metrics["step"]) - bar.n)
 
-            return nht.train_map(
+            trained = nht.train_map(
                 data,
                 make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device),
                 context_keys=env.context_keys,
@@ -76,6 +76,7 @@ def train_map(
                 seed=seed,
                 progress=show,
             )
+    return trained._replace(map=_with_corrections(trained.map, map.residual))
 
 
 def make_map(
@@ -125,17 +126,26 @@ def _jacobian(env: EnvConfig) -> nht.JacobianPinv:
     return nht.JacobianPinv(arm.A.tolist(), (arm.QUARTER_TURNS * math.pi / 2).tolist(), arm.D.tolist())
 
 
-def load_kind(path: str | Path, kind: str) -> nht.ActionMap:
-    """The map in a file, which must be of the given kind.
+def load_kind(path: str | Path, kind: str, residual: float | None = None) -> nht.ActionMap:
+    """The map in a file, which must be of the given kind; with corrections, if asked for, that it may or may not have.
 
     Raises:
-        ValueError: if it is not, for a run would carry the wrong name.
+        ValueError: if it is of another kind or has other corrections, for a run would carry the wrong name.
     """
     _check_kind(kind)
     map = nht.load_map(path)
-    if type(map) is not KINDS[kind]:
-        raise ValueError(f"{path} holds a {type(map).__name__}, but map.kind is {kind!r}.")
-    return map
+    core = map
+    if isinstance(map, nht.Residual):
+        core = map.map
+        if map.scale != residual:
+            raise ValueError(f"{path} holds a map with residual {map.scale}, but map.residual is {residual}.")
+    if type(core) is not KINDS[kind]:
+        raise ValueError(f"{path} holds a {type(core).__name__}, but map.kind is {kind!r}.")
+    return map if map is not core else _with_corrections(map, residual)
+
+
+def _with_corrections(map: nht.ActionMap, residual: float | None) -> nht.ActionMap:
+    return map if residual is None else nht.Residual(map, residual)
 
 
 def _check_kind(kind: str) -> None:

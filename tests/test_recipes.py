@@ -117,6 +117,24 @@ def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
     assert nht.load_map(tmp_path / "map.safetensors").action_dim == policy_size
 
 
+def test_any_map_can_have_corrections(demos, map_file, tmp_path):
+    overrides = ["map=svd", "map.residual=0.1", f"demos.path={demos}", f"out={tmp_path / 'svd'}"]
+    train_map.main(configure(TrainMap, "train_map", overrides))
+    saved = train_map.load_kind(tmp_path / "svd", "svd", residual=0.1)
+    assert (saved.action_dim, saved.scale) == (9, 0.1)
+    train(tmp_path / "run", map_file, "map.residual=0.2", "algo.total_frames=1000")  # around a map without
+    used = nht.load_map(tmp_path / "run" / "map.safetensors")
+    assert (type(used), used.scale, type(used.map)) == (nht.Residual, 0.2, nht.NHT)
+    with pytest.raises(ValueError, match=r"a map with residual 0\.1, but map\.residual is None"):
+        train_map.load_kind(tmp_path / "svd", "svd")
+    with pytest.raises(ValueError, match=r"holds a SVD, but map\.kind is 'nht'"):
+        train_map.load_kind(tmp_path / "svd", "nht", residual=0.1)
+    with pytest.raises(
+        ValueError, match=r"map\.residual must be positive, or null for no corrections, got -1\.0"
+    ):
+        configure(TrainMap, "train_map", ["map.residual=-1"])
+
+
 def test_wandb_works_offline_and_gets_video_and_map(map_file, tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     overrides = ["run.wandb=true", "evaluation.video=true", "algo.total_frames=1000"]
