@@ -3,19 +3,28 @@
 from importlib.metadata import version
 
 from nht.demos import Demos, load_demos, save_demos
+from nht.jacobian import JacobianPinv
+from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
+from nht.residual import Residual
+from nht.scl import SCL
 from nht.storage import load_map, save_map
 from nht.train import MapTraining, projection_error, train_map
 
 __all__ = [
+    "CAE",
+    "LASER",
     "NHT",
+    "SCL",
     "SVD",
     "ActionMap",
     "Demos",
     "Identity",
+    "JacobianPinv",
     "LinearActionMap",
     "MapTraining",
+    "Residual",
     "certificate",
     "load_demos",
     "load_map",

@@ -45,6 +45,7 @@ class Demos:
         actuation: Tensor,
         episode: Tensor,
         context: Tensor | Mapping[str, Tensor],
+        next_context: Tensor | Mapping[str, Tensor] | None = None,
         env: str = "unknown",
     ) -> "Demos":
         """Demonstrations from tensors of your own, in temporary memory-mapped files.
@@ -53,12 +54,16 @@ class Demos:
             actuation: (T, n), in order of time.
             episode: (T,), integers; the rows of an episode stand together.
             context: (T, context_dim), to be found under "context"; or several such tensors by key.
+            next_context: the same, one step later, to be found under "next"; some maps need it.
             env: a name for where they come from.
 
         Raises:
             ValueError: on data that are no whole, finite demonstrations.
         """
-        entries = dict(context) if isinstance(context, Mapping) else {"context": context}
+        entries: dict[str, Any] = dict(context) if isinstance(context, Mapping) else {"context": context}
+        if next_context is not None:
+            given = isinstance(next_context, Mapping)
+            entries["next"] = dict(next_context) if given else {"context": next_context}
         entries |= {"actuation": actuation, "episode": episode.long()}
         data = TensorDict(entries, batch_size=actuation.shape[:1])
         manifest = _manifest(data, env=env, seed=None, expert="unknown", settings={})

@@ -1,5 +1,7 @@
 """Householder geometry: from tangent vectors to an orthonormal frame, as pure functions of tensors.
 
+And least squares, for bases that are not orthonormal.
+
 Equation numbers are those of "Contextual Subspace Approximation with Neural Householder Transforms".
 With k unit vectors v_1 ... v_k in R^n, Q = H(v_1) ... H(v_k) is an orthogonal n x n matrix (Eq.
 8) and its first k columns are the basis (Eq. 7). No function here forms an n x n matrix: a reflection costs
@@ -65,3 +67,21 @@ def householder_frame(reflectors: Tensor) -> Tensor:
     action_dim, actuation_dim = reflectors.shape[-2:]
     columns = torch.eye(action_dim, actuation_dim, dtype=reflectors.dtype, device=reflectors.device)
     return reflect(reflectors.unsqueeze(-3), columns).mT
+
+
+def least_squares(basis: Tensor, actuation: Tensor) -> Tensor:
+    """The action whose actuation is nearest (Eq. 5), for any basis: (*batch, n, k), (*batch, n) -> (*batch, k).
+
+    Damped by a few roundings of the basis's largest entry: exact to rounding where the columns are clearly
+    independent, and finite, in value and gradient, where they are not. What a rank-deficient basis leaves
+    open gets about the smallest action.
+    """
+    rounding = torch.finfo(basis.dtype).eps
+    # Of unit size, lest squaring overflow. A basis below rounding counts as none.
+    size = basis.detach().abs().amax((-2, -1), keepdim=True).clamp_min(rounding)
+    columns = basis / size
+    damping = columns.shape[-2] * columns.shape[-1] * rounding
+    identity = torch.eye(columns.shape[-1], dtype=basis.dtype, device=basis.device)
+    gram = columns.mT @ columns + damping * identity
+    action = torch.linalg.solve_ex(gram, columns.mT @ actuation.unsqueeze(-1)).result
+    return (action / size).squeeze(-1)

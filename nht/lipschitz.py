@@ -2,7 +2,7 @@
 
 A layer s(W x + b) has the constant m |W|, with |W| the spectral norm of its matrix and m the largest slope of
 the activation. The constants of a composition multiply. From the network's output to the basis the map's
-`network_gain` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3). The normaliser, which divides
+`network_gain` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3), 1 for SCL. The normaliser, which divides
 the context by its deviations, is counted with the first layer, so that every statement is about the raw
 context.
 """
@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap
+from nht.residual import Residual
 
 ROUNDING = 1e-6  # a limit is undercut by this share, lest rounding a scaled matrix to float32 exceed it
 
@@ -26,12 +27,16 @@ def certificate(map: ActionMap) -> float:
     training kept to a limit or not.
 
     Returns:
-        0 for a basis that ignores the context; infinity for a map that is not linear in the action.
+        Of a Residual the constant of the map inside, as corrections do not depend on the context. 0 for a basis
+        that ignores the context; infinity where none is known, as for a map that is not linear
+        in the action.
     """
+    if isinstance(map, Residual):
+        return certificate(map.map)
     if not isinstance(map, LinearActionMap):
         return math.inf
     if map.network is None:
-        return 0.0
+        return map.network_gain
     norms = [torch.linalg.matrix_norm(matrix.double(), ord=2) for matrix in _matrices(map.network)]
     return map.network_gain * math.prod(_slopes(map.network)) * math.prod(float(norm) for norm in norms)
 

@@ -10,7 +10,13 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from nht.geometry import householder_apply, householder_coordinates, householder_frame, sphere_exp
+from nht.geometry import (
+    householder_apply,
+    householder_coordinates,
+    householder_frame,
+    least_squares,
+    sphere_exp,
+)
 
 Activation = Literal["relu", "sigmoid", "tanh"]
 NormKind = Literal["spectral", "frobenius"]
@@ -35,7 +41,12 @@ class ActionMap(nn.Module, ABC):
         action_scale: buffer, scalar: the largest |a_i| of the projected demonstrations. 1 until trained.
         actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
         actuation_high: buffer, (n,): the largest ones. infinity until trained.
+        learns: whether demonstrations decide what the map does, not only its bounds.
+        needs_next_context: whether `loss` reads ("next", "context"), (batch, context_dim).
     """
+
+    learns = True
+    needs_next_context = False
 
     action_scale: Tensor
     actuation_low: Tensor
@@ -68,7 +79,8 @@ class ActionMap(nn.Module, ABC):
         """What training minimises: the mean of |u - u_hat|^2, u_hat being u projected and mapped back.
 
         Args:
-            batch: "context" (batch, context_dim) and "actuation" (batch, n).
+            batch: "context" (batch, context_dim) and "actuation" (batch, n); and ("next", "context") for a map
+                that needs it.
         """
         actuation, context = batch["actuation"], batch["context"]
         return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
@@ -82,7 +94,7 @@ class ActionMap(nn.Module, ABC):
         return False
 
     def init_args(self) -> dict[str, Any]:
-        """The constructor's arguments, to be JSON values: they make an untrained twin."""
+        """The constructor's arguments, JSON values or other maps: they make an untrained twin."""
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
 
@@ -91,7 +103,8 @@ class LinearActionMap(ActionMap):
 
     Attributes:
         network: what turns the context into a description of the basis; None if the basis is always the same.
-        network_gain: a Lipschitz constant, in the spectral norm, from the network's output to the basis.
+        network_gain: a Lipschitz constant, in the spectral norm, from the network's output to the basis; without
+            a network, from the context to the basis.
         lipschitz: the Lipschitz constant of Q(c) that training keeps to; None for no limit.
         lipschitz_norm: the norm of the layers' matrices that is limited to this end.
     """
@@ -125,11 +138,13 @@ class LinearActionMap(ActionMap):
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
         """Least squares: the action whose actuation is nearest (Eq. 5)."""
-        return torch.linalg.lstsq(self.basis(context), actuation.unsqueeze(-1)).solution.squeeze(-1)
+        return least_squares(self.basis(context), actuation)
 
 
 class ContextNetwork(nn.Module):
     """A multilayer perceptron on the context, which it normalises first: (c - mean) / std.
+
+    It may have other inputs, which it takes as they are.
 
     Args:
         context_dim: width of the context.
@@ -137,13 +152,21 @@ class ContextNetwork(nn.Module):
         hidden: widths of the hidden layers; empty for a single linear layer.
         activation: after each hidden layer.
         seed: of the initial weights. The global random state is neither used nor changed.
+        other_dim: width of the other inputs.
     """
 
     context_mean: Tensor
     context_std: Tensor
 
     def __init__(
-        self, context_dim: int, output_dim: int, hidden: Sequence[int], activation: Activation, seed: int
+        self,
+        context_dim: int,
+        output_dim: int,
+        hidden: Sequence[int],
+        activation: Activation,
+        seed: int,
+        *,
+        other_dim: int = 0,
     ) -> None:
         super().__init__()
         _check_choice("activation", activation, get_args(Activation))
@@ -152,14 +175,16 @@ class ContextNetwork(nn.Module):
         self.activation = activation
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
-            widths = (context_dim, *hidden, output_dim)
+            widths = (context_dim + other_dim, *hidden, output_dim)
             self.layers = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
         self.register_buffer("context_mean", torch.zeros(context_dim))
         self.register_buffer("context_std", torch.ones(context_dim))
 
-    def forward(self, context: Tensor) -> Tensor:
-        """Maps (*batch, context_dim) to (*batch, output_dim)."""
+    def forward(self, context: Tensor, *others: Tensor) -> Tensor:
+        """Maps (*batch, context_dim), and others (*batch, width), to (*batch, output_dim)."""
         value = (context - self.context_mean) / self.context_std
+        if others:
+            value = torch.cat([value, *others], dim=-1)
         for layer in self.layers[:-1]:
             value = getattr(torch, self.activation)(layer(value))
         return self.layers[-1](value)
@@ -181,6 +206,13 @@ class ContextNetwork(nn.Module):
         floor = FLATTEST * std.max()
         self.context_mean.copy_(context.mean(0))
         self.context_std.copy_(std.clamp_min(floor) if floor > 0 else torch.ones_like(std))
+
+    @torch.no_grad()
+    def start_from_one_output(self, size: float, seed: int) -> None:
+        """Lets all contexts start from nearly the same output, normally distributed with deviation `size`."""
+        head = self.linear(-1)
+        head.weight.mul_(0.1)
+        head.bias.normal_(std=size, generator=torch.Generator().manual_seed(seed))
 
 
 class NHT(LinearActionMap):
@@ -228,21 +260,11 @@ class NHT(LinearActionMap):
         self.normalise = normalise
         self.seed = seed
         self.network = ContextNetwork(context_dim, action_dim * (actuation_dim - 1), hidden, activation, seed)
-        self._start_from_one_frame()
+        # Tangents of length about 1. From tangents near 0, where all reflectors coincide, contexts can set out for
+        # opposite sides of the sphere. The two parts then meet in a steep wall, which training cannot tear down:
+        # such fits ended at 100 times the error of the others.
+        self.network.start_from_one_output((actuation_dim - 1) ** -0.5, seed)
         self.network_gain = 2 * action_dim**0.5  # Theorem 1; the exponential map has the constant 1
-
-    @torch.no_grad()
-    def _start_from_one_frame(self) -> None:
-        """Lets all contexts start from nearly the same tangents, of length about 1 and random direction.
-
-        From tangents near 0, where all reflectors coincide, contexts can set out for opposite sides of the sphere.
-        The two parts then meet in a steep wall, which training cannot tear down: such fits ended at 100 times the
-        error of the others.
-        """
-        head = self.network.linear(-1)
-        generator = torch.Generator().manual_seed(self.seed)
-        head.weight.mul_(0.1)
-        head.bias.normal_(std=(self.actuation_dim - 1) ** -0.5, generator=generator)
 
     def reflectors(self, context: Tensor) -> Tensor:
         """The unit vectors v_1 ... v_k (Eq. 12): (*batch, context_dim) -> (*batch, k, n)."""
@@ -308,6 +330,8 @@ class SVD(LinearActionMap):
 
 class Identity(LinearActionMap):
     """The raw interface: the action is the actuation, k = n."""
+
+    learns = False
 
     def __init__(self, actuation_dim: int, context_dim: int = 0) -> None:
         super().__init__(context_dim, actuation_dim, actuation_dim)

@@ -80,7 +80,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
 def _description(map: ActionMap) -> dict[str, Any]:
     return {
         "class": type(map).__name__,
-        "init_args": map.init_args(),
+        "init_args": _encoded(map),
         "context_keys": map.context_keys,
         "data_fingerprint": map.data_fingerprint,
         "context_dim": map.context_dim,
@@ -91,6 +91,16 @@ def _description(map: ActionMap) -> dict[str, Any]:
         "actuation_high": [_finite(value) for value in map.actuation_high.tolist()],
         "lipschitz_certificate": _finite(certificate(map)),
         "nht_version": version("nht"),
+    }
+
+
+def _encoded(map: ActionMap) -> dict[str, Any]:
+    """A map's arguments; a map among them becomes its class and arguments."""
+    return {
+        name: {"class": type(value).__name__, "init_args": _encoded(value)}
+        if isinstance(value, ActionMap)
+        else value
+        for name, value in map.init_args().items()
     }
 
 
@@ -118,8 +128,12 @@ def _untrained(description: dict[str, Any], path: Path) -> ActionMap:
             f"{path} holds a map of the unknown class {name!r}; known are {', '.join(sorted(known))}. "
             "Import a class of your own before loading its map"
         )
+    arguments = {
+        key: _untrained(value, path) if isinstance(value, dict) and "class" in value else value
+        for key, value in dict(description["init_args"]).items()
+    }
     try:
-        return known[name](**description["init_args"])
+        return known[name](**arguments)
     except TypeError as error:
         raise ValueError(f"{path} holds arguments that {name} does not take: {error}") from error
 

@@ -66,7 +66,7 @@ def train_map(
         progress: called at every evaluation with "step", "loss", "validation_error" and "seconds".
 
     Raises:
-        KeyError: on a context key that the demonstrations lack.
+        KeyError: on a context key that the demonstrations lack, or lack under "next" where the map needs it.
         ValueError: on demonstrations that do not fit the map, or have fewer than k independent actuations or
             two episodes; on a number out of range. FloatingPointError: if the loss diverged from the start.
     """
@@ -213,12 +213,25 @@ def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> T
         )
     singular = torch.linalg.svdvals(actuation.double())
     rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
-    if rank < map.action_dim < map.actuation_dim:
+    if map.learns and rank < map.action_dim < map.actuation_dim:
         raise ValueError(
             f"the demonstrations have {rank} independent actuations, too few for k = {map.action_dim}"
         )
     data = TensorDict({"context": context, "actuation": actuation}, batch_size=len(actuation))
+    if map.needs_next_context:
+        data["next", "context"] = _next_context(demos, map, keys)
     return data.to(map.action_scale.device, map.action_scale.dtype)
+
+
+def _next_context(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> Tensor:
+    following = [("next", *((key,) if isinstance(key, str) else key)) for key in keys]
+    missing = [key for key in following if key not in demos.data.keys(include_nested=True)]
+    if missing:
+        raise KeyError(
+            f"{type(map).__name__} learns from the next context too, but the demonstrations lack "
+            f"{', '.join(repr(key) for key in missing)}; a LASER with beta_dynamics=0 does without"
+        )
+    return demos.context(following)
 
 
 @torch.no_grad()

@@ -34,7 +34,7 @@ class DemosConfig:
 class MapConfig:
     """Which action map, and how it is trained."""
 
-    kind: str = "nht"  # nht, svd or none (raw actuation)
+    kind: str = "nht"  # nht, scl, laser, cae, svd, jacobian or none (raw actuation)
     file: str | None = None  # a saved map; None trains one from the demonstrations
     action_dim: int = 2
     hidden: list[int] = field(default_factory=lambda: [256, 256])
@@ -43,7 +43,17 @@ class MapConfig:
     learning_rate: float = 1e-3
     batch_size: int = 256
     max_steps: int = 6_000
+    beta_kl: float = 1e-3  # laser: weight of the KL divergence of its latents
+    beta_dynamics: float = 1e-3  # laser: weight of predicting the next context
+    residual: float | None = None  # adds n corrections to the action, each worth this much actuation
     action_scale: float | None = 1.0  # actuation per unit of action; None takes the demonstrations' largest
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for corrections without a positive size."""
+        if self.residual is not None and not self.residual > 0:
+            raise ValueError(
+                f"map.residual must be positive, or null for no corrections, got {self.residual}."
+            )
 
 
 @dataclass

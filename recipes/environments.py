@@ -62,6 +62,6 @@ def run_map(config: DDPG, folder: Path) -> nht.ActionMap:
         if config.map.file is None:
             map = train_map(config.map, config.env, config.demos, config.seed).map
         else:
-            map = load_kind(config.map.file, config.map.kind)
+            map = load_kind(config.map.file, config.map.kind, config.map.residual)
         nht.save_map(map, kept)
     return nht.load_map(kept, device=config.device)

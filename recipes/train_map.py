@@ -5,6 +5,7 @@ python -m nht.recipes.train_map map=nht demos.path=runs/demos-wam_wipe
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
@@ -12,13 +13,25 @@ from typing import cast
 from tqdm import tqdm
 
 import nht
+from nht.envs import wam_kinematics
 from nht.maps import Activation
 from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
 from nht.recipes.launch import launch
 
-KINDS: dict[str, type[nht.ActionMap]] = {"nht": nht.NHT, "svd": nht.SVD, "none": nht.Identity}
+KINDS: dict[str, type[nht.ActionMap]] = {
+    "nht": nht.NHT,
+    "scl": nht.SCL,
+    "laser": nht.LASER,
+    "cae": nht.CAE,
+    "svd": nht.SVD,
+    "jacobian": nht.JacobianPinv,
+    "none": nht.Identity,
+}
 """Every kind of map by the name that configurations use."""
+
+ARMS = {"wam_wipe": wam_kinematics, "wam_grasp": wam_kinematics}
+"""The kinematics of every task that is done by an arm with known ones."""
 
 
 def main(config: TrainMap) -> None:
@@ -53,9 +66,9 @@ def train_map(
                 bar.set_postfix(error=f"{metrics['validation_error']:.2e}", refresh=False)
                 bar.update(int(metrics["step"]) - bar.n)
 
-            return nht.train_map(
+            trained = nht.train_map(
                 data,
-                make_map(map, context_dim, data.actuation.shape[-1], seed).to(device),
+                make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device),
                 context_keys=env.context_keys,
                 batch_size=map.batch_size,
                 learning_rate=map.learning_rate,
@@ -63,41 +76,76 @@ def train_map(
                 seed=seed,
                 progress=show,
             )
+    return trained._replace(map=_with_corrections(trained.map, map.residual))
 
 
-def make_map(map: MapConfig, context_dim: int, actuation_dim: int, seed: int) -> nht.ActionMap:
+def make_map(
+    map: MapConfig, context_dim: int, actuation_dim: int, seed: int, env: EnvConfig | None = None
+) -> nht.ActionMap:
     """The untrained map of a kind.
 
+    Args:
+        map: which kind, and its options.
+        context_dim: width of the context.
+        actuation_dim: n.
+        seed: of the initial weights.
+        env: the task; only the kind "jacobian" asks what arm it has.
+
     Raises:
-        ValueError: for an unknown kind; the message lists those that exist.
+        ValueError: for an unknown kind; the message lists those that exist. For a Lipschitz limit that the kind
+            cannot keep to, or a Jacobian where there is no arm.
     """
-    if map.kind == "nht":
-        return nht.NHT(
-            context_dim,
-            actuation_dim,
-            map.action_dim,
-            hidden=tuple(map.hidden),
-            activation=cast(Activation, map.activation),
-            lipschitz=map.lipschitz,
-            seed=seed,
-        )
+    _check_kind(map.kind)
+    if map.kind == "none":
+        return nht.Identity(actuation_dim, context_dim=context_dim)
     if map.kind == "svd":
         return nht.SVD(actuation_dim, map.action_dim, context_dim=context_dim)
-    _check_kind(map.kind)
-    return nht.Identity(actuation_dim, context_dim=context_dim)
+    if map.kind == "jacobian":
+        return _jacobian(env or EnvConfig(name="unknown"))
+    sizes = (context_dim, actuation_dim, map.action_dim, map.hidden, cast(Activation, map.activation))
+    if map.lipschitz is not None and map.kind in ("laser", "cae"):
+        raise ValueError(f"map.lipschitz limits nht and scl, there is no limit for {map.kind!r}.")
+    if map.kind == "laser":
+        return nht.LASER(*sizes, beta_kl=map.beta_kl, beta_dynamics=map.beta_dynamics, seed=seed)
+    if map.kind == "cae":
+        return nht.CAE(*sizes, seed=seed)
+    linear = nht.SCL if map.kind == "scl" else nht.NHT
+    return linear(*sizes, lipschitz=map.lipschitz, seed=seed)
 
 
-def load_kind(path: str | Path, kind: str) -> nht.ActionMap:
-    """The map in a file, which must be of the given kind.
+def _jacobian(env: EnvConfig) -> nht.JacobianPinv:
+    if env.name not in ARMS:
+        raise ValueError(
+            f"map.kind 'jacobian' needs an arm's kinematics: {sorted(ARMS)} have one, {env.name!r} does not."
+        )
+    if env.context_keys != ["joint_angle"]:
+        raise ValueError(
+            f"map.kind 'jacobian' needs env.context_keys=[joint_angle], as map=jacobian sets, got {env.context_keys}."
+        )
+    arm = ARMS[env.name]
+    return nht.JacobianPinv(arm.A.tolist(), (arm.QUARTER_TURNS * math.pi / 2).tolist(), arm.D.tolist())
+
+
+def load_kind(path: str | Path, kind: str, residual: float | None = None) -> nht.ActionMap:
+    """The map in a file, which must be of the given kind; with corrections, if asked for, that it may or may not have.
 
     Raises:
-        ValueError: if it is not, for a run would carry the wrong name.
+        ValueError: if it is of another kind or has other corrections, for a run would carry the wrong name.
     """
     _check_kind(kind)
     map = nht.load_map(path)
-    if type(map) is not KINDS[kind]:
-        raise ValueError(f"{path} holds a {type(map).__name__}, but map.kind is {kind!r}.")
-    return map
+    core = map
+    if isinstance(map, nht.Residual):
+        core = map.map
+        if map.scale != residual:
+            raise ValueError(f"{path} holds a map with residual {map.scale}, but map.residual is {residual}.")
+    if type(core) is not KINDS[kind]:
+        raise ValueError(f"{path} holds a {type(core).__name__}, but map.kind is {kind!r}.")
+    return map if map is not core else _with_corrections(map, residual)
+
+
+def _with_corrections(map: nht.ActionMap, residual: float | None) -> nht.ActionMap:
+    return map if residual is None else nht.Residual(map, residual)
 
 
 def _check_kind(kind: str) -> None:

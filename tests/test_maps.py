@@ -48,6 +48,7 @@ def every_map() -> list[ActionMap]:
         nht.NHT(CONTEXT_DIM, 3, 3, hidden=(8, 8, 8), activation="sigmoid", normalise=True),
         trained_svd,
         nht.Identity(7, CONTEXT_DIM),
+        nht.SCL(CONTEXT_DIM, 7, 3, hidden=(16,), normalise=True),
         FreeBasis(7, 2, CONTEXT_DIM),
     ]
     return [map.double() for map in maps]
@@ -171,11 +172,10 @@ def test_svd_spans_the_leading_singular_vectors() -> None:
 @pytest.mark.slow
 @each_map
 def test_maps_compile_into_one_graph(map: ActionMap) -> None:
-    if isinstance(map, FreeBasis):
-        pytest.skip("torch.linalg.lstsq has no single-graph form")
     action, context = normal(8, map.action_dim), normal(8, CONTEXT_DIM, seed=1)
-    compiled = torch.compile(map, fullgraph=True)
-    assert torch.allclose(compiled(action, context), map(action, context))
+    actuation = torch.compile(map, fullgraph=True)(action, context)
+    assert torch.allclose(actuation, map(action, context))
+    assert torch.allclose(torch.compile(map.project, fullgraph=True)(actuation, context), action)
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_stopping_and_resuming_equals_going_on(run, map_file, tmp_path):
     assert (resumed / "policy.safetensors").read_bytes() == (folder / "policy.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["svd", "none"])
+@pytest.mark.parametrize("kind", ["scl", "laser", "cae", "svd", "jacobian", "none"])
 def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
     overrides = [
         *TINY,
@@ -109,9 +109,11 @@ def test_other_interfaces_run_from_the_demonstrations(kind, demos, tmp_path):
         f"demos.path={demos}",
         f"run.folder={tmp_path}",
         "algo.total_frames=1000",
+        "map.max_steps=250",
+        "map.hidden=[16]",
     ]
     ddpg.main(configure(DDPG, "ddpg", overrides))
-    policy_size = {"svd": 2, "none": 7}[kind]
+    policy_size = {"none": 7, "jacobian": 6}.get(kind, 2)
     assert nht.load_map(tmp_path / "map.safetensors").action_dim == policy_size
 
 
@@ -119,6 +121,24 @@ def test_the_papers_settings_run(map_file, tmp_path):
     metrics = train(tmp_path / "run", map_file, "algo=ddpg_paper", "algo.updates_per_batch=45")
     assert metrics["updates"].tolist() == [4 * 45, 9 * 45]
     assert metrics["loss_value"].notna().all()
+
+
+def test_any_map_can_have_corrections(demos, map_file, tmp_path):
+    overrides = ["map=svd", "map.residual=0.1", f"demos.path={demos}", f"out={tmp_path / 'svd'}"]
+    train_map.main(configure(TrainMap, "train_map", overrides))
+    saved = train_map.load_kind(tmp_path / "svd", "svd", residual=0.1)
+    assert (saved.action_dim, saved.scale) == (9, 0.1)
+    train(tmp_path / "run", map_file, "map.residual=0.2", "algo.total_frames=1000")  # around a map without
+    used = nht.load_map(tmp_path / "run" / "map.safetensors")
+    assert (type(used), used.scale, type(used.map)) == (nht.Residual, 0.2, nht.NHT)
+    with pytest.raises(ValueError, match=r"a map with residual 0\.1, but map\.residual is None"):
+        train_map.load_kind(tmp_path / "svd", "svd")
+    with pytest.raises(ValueError, match=r"holds a SVD, but map\.kind is 'nht'"):
+        train_map.load_kind(tmp_path / "svd", "nht", residual=0.1)
+    with pytest.raises(
+        ValueError, match=r"map\.residual must be positive, or null for no corrections, got -1\.0"
+    ):
+        configure(TrainMap, "train_map", ["map.residual=-1"])
 
 
 def test_wandb_works_offline_and_gets_video_and_map(map_file, tmp_path, monkeypatch):
@@ -214,6 +234,25 @@ def test_demonstrations_of_another_env(demos, tmp_path):
     manifest.write_text(manifest.read_text().replace('"env": "wam_wipe"', '"env": "cheetah"'))
     with pytest.raises(ValueError, match=r"of env 'cheetah', expected 'wam_wipe'"):
         train_map.main(configure(TrainMap, "train_map", [f"demos.path={tmp_path / 'demos'}", "out=unused"]))
+
+
+def test_a_jacobian_without_an_arm():
+    config = configure(TrainMap, "train_map", ["map=jacobian", "out=unused"])
+    assert config.env.context_keys == ["joint_angle"]
+    cheetah = replace(config.env, name="half_cheetah")
+    with pytest.raises(
+        ValueError, match=r"kinematics: \['wam_grasp', 'wam_wipe'\] have one, 'half_cheetah' does not"
+    ):
+        train_map.make_map(config.map, 17, 6, 0, cheetah)
+    wide = replace(config.env, context_keys=["tool_position", "joint_angle"])
+    with pytest.raises(ValueError, match=r"needs env.context_keys=\[joint_angle\].*'tool_position'"):
+        train_map.make_map(config.map, 10, 7, 0, wide)
+
+
+def test_a_lipschitz_limit_for_a_map_that_has_none():
+    config = configure(TrainMap, "train_map", ["map=laser", "map.lipschitz=2", "out=unused"])
+    with pytest.raises(ValueError, match=r"map.lipschitz limits nht and scl, there is no limit for 'laser'"):
+        train_map.make_map(config.map, 10, 7, 0)
 
 
 def test_an_unknown_option_of_the_task(tmp_path):

@@ -46,6 +46,7 @@ def trained(map: ActionMap) -> ActionMap:
 MAPS: dict[str, Callable[[], ActionMap]] = {
     "nht": lambda: nht.NHT(10, 7, 2, (16, 8), "sigmoid", normalise=True, lipschitz=4.0, seed=3),
     "double": lambda: nht.NHT(10, 7, 3, hidden=()).double(),
+    "scl": lambda: nht.SCL(10, 7, 2, (16, 8), "relu", lipschitz=4.0),
     "svd": lambda: nht.SVD(7, 2, 10),
     "identity": lambda: nht.Identity(7),
     "own": lambda: ScaledIdentity(7, 0.5),
@@ -184,6 +185,23 @@ def test_safetensors_files_of_others_are_refused(path: Path) -> None:
         ({"header": {"map": "{"}}, "its description is damaged"),
         ({"header": {"map": "{}"}}, "its description is damaged: 'class'"),
         ({"description": {"class": "Unheard"}}, "unknown class 'Unheard'; known are .*Identity.*NHT.*SVD"),
+        (
+            {"description": {"class": "SCL"}},
+            r"do not fit SCL: network.layers.1.weight is .* \(12, 16\), .* \(14, 16\)",
+        ),
+        (
+            {"description": {"class": "SVD", "init_args": {"actuation_dim": 7, "action_dim": 2}}},
+            r"do not fit SVD: missing \['frame'\], unexpected \['network",
+        ),
+        (
+            {"description": {"class": "Residual", "init_args": {"map": {"class": "Path"}, "scale": 1}}},
+            "unknown class 'Path'",
+        ),
+        (
+            {"description": {"class": "Residual", "init_args": {"map": 3, "scale": 1}}},
+            "must be an action map",
+        ),
+        ({"description": {"init_args": 3}}, "its description is damaged"),
         ({"description": {"class": "LinearActionMap"}}, "unknown class 'LinearActionMap'"),
         ({"description": {"init_args": {"width": 3}}}, "arguments that NHT does not take: .*'width'"),
         (

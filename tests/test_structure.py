@@ -63,6 +63,7 @@ def test_imports_form_no_circle():
         ("nht.geometry", "from nht import maps"),
         ("nht.maps", "def f():\n    import nht.lipschitz"),
         ("nht.laser", "from nht.train import train_map"),
+        ("nht.laser", "from nht.scl import SCL"),
         ("nht.train", "from nht import NHT"),
         ("nht.train", "import torchrl.envs"),
         ("nht.demos", "import hydra"),
@@ -73,7 +74,16 @@ def test_imports_form_no_circle():
     ],
 )
 def test_a_wrong_import_is_noticed(module, source):
-    modules = ["nht", "nht.geometry", "nht.maps", "nht.lipschitz", "nht.train", "nht.transforms", "nht.envs"]
+    modules = [
+        "nht",
+        "nht.geometry",
+        "nht.maps",
+        "nht.scl",
+        "nht.lipschitz",
+        "nht.train",
+        "nht.transforms",
+        "nht.envs",
+    ]
     trees = {name: ast.parse("") for name in modules} | {module: ast.parse(source)}
     assert len(import_violations(trees)) == 1
 

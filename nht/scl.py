@@ -1,0 +1,79 @@
+"""SCL, the state-conditioned linear map: a basis without structure, to compare with orthonormal ones (A.4)."""
+
+from collections.abc import Sequence
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from nht.maps import Activation, ContextNetwork, LinearActionMap, NormKind
+
+
+class SCL(LinearActionMap):
+    """State-conditioned linear map: the entries of the basis straight from a network (A.4).
+
+    An action is projected by the pseudo-inverse, damped at the level of rounding. Nothing limits the norm of the
+    basis, and the loss (Eq. 6) does not depend on it: it may grow in training, and with it the actuation that an
+    action of 1 stands for. `lipschitz` limits how fast the basis changes, not how long its columns are.
+
+    The network's output is the basis, entry by entry. Its Euclidean norm is the Frobenius norm of the basis, which is
+    no smaller than the spectral one: from output to basis the Lipschitz constant is 1.
+
+    Args:
+        context_dim: width of the context.
+        actuation_dim: n.
+        action_dim: k, in 1 ... n.
+        hidden: widths of the hidden layers.
+        activation: "relu", "sigmoid" or "tanh".
+        normalise: scale the entries of the context by their mean and deviation in the training data.
+        lipschitz: Lipschitz constant of Q(c) that training keeps to, in the spectral norm and the raw
+            context.
+        lipschitz_norm: the norm of the layers' matrices that is limited to this end, "spectral" or "frobenius".
+        seed: of the initial weights.
+
+    Raises:
+        ValueError: on an argument out of its range.
+    """
+
+    network: ContextNetwork
+
+    def __init__(
+        self,
+        context_dim: int,
+        actuation_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (256, 256),
+        activation: Activation = "tanh",
+        *,
+        normalise: bool = False,
+        lipschitz: float | None = None,
+        lipschitz_norm: NormKind = "spectral",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(context_dim, actuation_dim, action_dim, lipschitz, lipschitz_norm)
+        self.hidden = tuple(hidden)
+        self.activation = activation
+        self.normalise = normalise
+        self.seed = seed
+        self.network = ContextNetwork(context_dim, actuation_dim * action_dim, hidden, activation, seed)
+        self.network.start_from_one_output(actuation_dim**-0.5, seed)  # columns of length about 1
+        self.network_gain = 1.0
+
+    def basis(self, context: Tensor) -> Tensor:
+        """Q(c), any n x k matrix."""
+        return self.network(context).unflatten(-1, (self.actuation_dim, self.action_dim))
+
+    def loss(self, batch: TensorDictBase) -> Tensor:
+        """The mean of |u - Q Q^+ u|^2 (Eq. 6).
+
+        At the least-squares action the loss does not change with the action (envelope theorem). So the action counts
+        as a constant in the gradient, and no derivative of an inverse is ever taken.
+        """
+        actuation, context = batch["actuation"], batch["context"]
+        action = self.project(actuation, context).detach()
+        return (actuation - self(action, context)).square().sum(-1).mean()
+
+    def fit(self, batch: TensorDictBase) -> bool:
+        """Sets the normaliser; the weights are left to gradient steps."""
+        if self.normalise:
+            self.network.normalise(batch["context"])
+        return False
