@@ -181,6 +181,19 @@ class Evaluate:
 
 
 @dataclass
+class CompareMaps:
+    """``python -m nht.recipes.compare_maps``."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    map: MapConfig = field(default_factory=MapConfig)  # what all maps have in common
+    maps: list[str] = field(default_factory=lambda: ["nht", "laser", "svd", "scl"])
+    action_dims: list[int] = field(default_factory=lambda: [1, 2, 3])
+    seed: int = 0
+    out: str = ""
+
+
+@dataclass
 class Report:
     """``python -m nht.recipes.report``."""
 

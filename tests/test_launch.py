@@ -6,12 +6,13 @@ import sys
 
 import pytest
 
-from nht.recipes.config import DDPG, CollectDemos, Evaluate, Report, TrainMap
+from nht.recipes.config import DDPG, CollectDemos, CompareMaps, Evaluate, Report, TrainMap
 from nht.recipes.launch import configure
 
 SCHEMAS = {
     "collect_demos": CollectDemos,
     "train_map": TrainMap,
+    "compare_maps": CompareMaps,
     "ddpg": DDPG,
     "evaluate": Evaluate,
     "report": Report,

@@ -7,10 +7,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 import nht
+from nht.envs import make_env
 from nht.geometry import least_squares
 from nht.lipschitz import LipschitzProjection
+from nht.transforms import ActionMapTransform
 
 CONTEXT_DIM, N, K = 4, 7, 3
 
@@ -109,6 +112,18 @@ def test_a_rank_deficient_start_does_not_poison_the_training() -> None:
             optimiser.step()
     assert all(parameter.isfinite().all() for parameter in map.parameters())
     assert map.loss(data) < 0.5 * first
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("size", [1e3, 1e20, 1e38])
+def test_the_environment_survives_a_basis_of_any_norm(size: float) -> None:
+    map = nht.SCL(10, 7, 2, hidden=(16,))
+    for parameter in map.network.linear(-1).parameters():
+        parameter.mul_(size)
+    transform = ActionMapTransform(map, ["tool_position", "joint_angle"], action_scale=1.0)
+    steps = TransformedEnv(make_env("wam_wipe", num_envs=2), transform).rollout(20, break_when_any_done=False)
+    assert steps["next", "observation"].isfinite().all()
+    assert steps["next", "actuation"].abs().max() == 2  # the joints' largest speed
 
 
 @torch.no_grad()
