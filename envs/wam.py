@@ -175,22 +175,23 @@ class WAMWipe(BatchedTask):
         self._update_pose()
 
     def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
-        """Draw the goal as a disc: green once reached, red after a violation, else orange."""
+        """Draw the goal as a disc, in a halo wider than the tool: green once reached, red after a violation."""
         if self.failed[row]:
-            colour = (0.85, 0.15, 0.15, 1.0)
+            colour = (0.85, 0.15, 0.15)
         elif np.linalg.norm(self._position[row] - self.goal[row]) < self.success_radius:
-            colour = (0.2, 0.7, 0.25, 1.0)
+            colour = (0.2, 0.7, 0.25)
         else:
-            colour = (0.95, 0.6, 0.1, 1.0)
-        scene.ngeom += 1
-        mujoco.mjv_initGeom(
-            scene.geoms[scene.ngeom - 1],
-            mujoco.mjtGeom.mjGEOM_CYLINDER,
-            np.array([self.success_radius, 0.001, 0.0]),
-            self.goal[row] + np.array([0.0, 0.0, 0.001]),
-            np.eye(3).ravel(),
-            np.array(colour, dtype=np.float32),
-        )
+            colour = (0.95, 0.6, 0.1)
+        for radius, opacity in ((self.success_radius, 1.0), (2.5 * self.success_radius, 0.35)):
+            scene.ngeom += 1
+            mujoco.mjv_initGeom(
+                scene.geoms[scene.ngeom - 1],
+                mujoco.mjtGeom.mjGEOM_CYLINDER,
+                np.array([radius, 0.001, 0.0]),
+                self.goal[row] + np.array([0.0, 0.0, 0.001]),
+                np.eye(3).ravel(),
+                np.array([*colour, opacity], dtype=np.float32),
+            )
 
 
 def brake(joint_angle: Array, velocity: Array) -> Array:

@@ -111,7 +111,9 @@ def plot(curves: pandas.DataFrame, title: str, path: Path) -> None:
         by_frames = group.groupby("frames")["eval_success"]
         frames = np.array(list(by_frames.groups))
         bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
-        (line,) = axes.plot(frames, by_frames.mean(), label=f"{interface} ({group['seed'].nunique()} seeds)")
+        seeds = group["seed"].nunique()
+        label = f"{interface} ({seeds} seed{'s' if seeds > 1 else ''})"
+        (line,) = axes.plot(frames, by_frames.mean(), label=label)
         axes.fill_between(frames, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.2, linewidth=0)
     axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03), title=title)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k")
