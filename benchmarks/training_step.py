@@ -33,8 +33,8 @@ from nht.recipes.launch import configure
 from nht.recipes.losses import PaperDDPGLoss
 from nht.recipes.networks import ddpg_networks, exploring
 
-ROUNDS = 5
-SHORT, LONG = 4_000, 10_000  # frames
+ROUNDS = 4
+SHORT, LONG = 2_000, 6_000  # frames
 
 
 def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
