@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
@@ -53,7 +53,7 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
             "Hydra's multirun (-m) is not supported: start one process for each run."
         )
     try:
-        return OmegaConf.to_object(_compose(schema, name, overrides))  # type: ignore[return-value]
+        return cast(Config, OmegaConf.to_object(_compose(schema, name, overrides)))
     except (HydraException, OmegaConfBaseException) as error:
         reason = str(error.__cause__ or error).splitlines()[0]
         raise ValueError(f"{str(error).splitlines()[0]} ({reason}){_existing(schema, error)}") from error
