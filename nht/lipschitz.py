@@ -4,7 +4,7 @@ A layer s(W x + b) has the constant m |W|, with |W| the spectral norm of its mat
 the activation. The constants of a composition multiply. From the network's output to the basis the map's
 `network_gain` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3), 1 for SCL. The normaliser, which divides
 the context by its deviations, is counted with the first layer, so that every statement is about the raw
-context.
+context. Heads side by side have the constant of the largest.
 """
 
 import math
@@ -37,7 +37,7 @@ def certificate(map: ActionMap) -> float:
         return math.inf
     if map.network is None:
         return map.network_gain
-    norms = [torch.linalg.matrix_norm(matrix.double(), ord=2) for matrix in _matrices(map.network)]
+    norms = [torch.linalg.matrix_norm(matrix.double(), ord=2).max() for matrix in _matrices(map.network)]
     return map.network_gain * math.prod(_slopes(map.network)) * math.prod(float(norm) for norm in norms)
 
 
@@ -63,7 +63,7 @@ class LipschitzProjection:
         slopes = _slopes(self.network)
         per_layer = (map.lipschitz / map.network_gain) ** (1 / len(slopes)) * (1 - ROUNDING)
         self.limits = [per_layer / slope for slope in slopes]
-        self.directions: list[Tensor] = []  # of each matrix, close to its leading right singular vector
+        self.directions: list[Tensor] = []  # of each matrix, close to its leading right singular vector, a column
         self.exact()
 
     @torch.no_grad()
@@ -71,10 +71,10 @@ class LipschitzProjection:
         """After an optimiser step."""
         for i, matrix in enumerate(_matrices(self.network)):
             if self.frobenius:
-                norm = torch.linalg.matrix_norm(matrix)
+                norm = torch.linalg.matrix_norm(matrix, keepdim=True)
             else:
-                self.directions[i] = functional.normalize(matrix.mT @ (matrix @ self.directions[i]), dim=0)
-                norm = torch.linalg.vector_norm(matrix @ self.directions[i])
+                self.directions[i] = functional.normalize(matrix.mT @ (matrix @ self.directions[i]), dim=-2)
+                norm = torch.linalg.vector_norm(matrix @ self.directions[i], dim=-2, keepdim=True)
             self._scale(i, norm)
 
     @torch.no_grad()
@@ -83,15 +83,16 @@ class LipschitzProjection:
         self.directions = []
         for i, matrix in enumerate(_matrices(self.network)):
             _, singular, right = torch.linalg.svd(matrix.double(), full_matrices=False)
-            self.directions.append(right[0].to(matrix.dtype))
-            self._scale(i, torch.linalg.vector_norm(singular) if self.frobenius else singular[0])
+            self.directions.append(right[..., :1, :].mT.to(matrix.dtype))
+            norm = torch.linalg.vector_norm(singular, dim=-1) if self.frobenius else singular[..., 0]
+            self._scale(i, norm[..., None, None])
 
     def _scale(self, index: int, norm: Tensor) -> None:
         self.network.linear(index).weight.mul_((self.limits[index] / norm).clamp_max(1))
 
 
 def _matrices(network: ContextNetwork) -> list[Tensor]:
-    """The layers' matrices, the first one as it acts on the raw context."""
+    """The layers' matrices, of the heads one each; the first one as it acts on the raw context."""
     weights = [network.linear(i).weight for i in range(len(network.layers))]
     return [weights[0] / network.context_std, *weights[1:]]
 

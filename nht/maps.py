@@ -141,6 +141,27 @@ class LinearActionMap(ActionMap):
         return least_squares(self.basis(context), actuation)
 
 
+class Heads(nn.Module):
+    """Linear layers side by side, each on its own share of the input: one layer with a block-diagonal matrix.
+
+    Args:
+        heads: number of layers.
+        input_dim: width of each one's input.
+        output_dim: width of each one's output.
+    """
+
+    def __init__(self, heads: int, input_dim: int, output_dim: int) -> None:
+        super().__init__()
+        layers = [nn.Linear(input_dim, output_dim) for _ in range(heads)]
+        self.weight = nn.Parameter(torch.stack([layer.weight.detach() for layer in layers]))
+        self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers]))
+
+    def forward(self, value: Tensor) -> Tensor:
+        """Maps (*batch, heads * input_dim) to (*batch, heads * output_dim)."""
+        shares = value.unflatten(-1, (len(self.weight), -1)).unsqueeze(-1)
+        return ((self.weight @ shares).squeeze(-1) + self.bias).flatten(-2)
+
+
 class ContextNetwork(nn.Module):
     """A multilayer perceptron on the context, which it normalises first: (c - mean) / std.
 
@@ -153,6 +174,7 @@ class ContextNetwork(nn.Module):
         activation: after each hidden layer.
         seed: of the initial weights. The global random state is neither used nor changed.
         other_dim: width of the other inputs.
+        heads: equal parts of the output, each of which gets a last hidden layer of its own.
     """
 
     context_mean: Tensor
@@ -167,16 +189,24 @@ class ContextNetwork(nn.Module):
         seed: int,
         *,
         other_dim: int = 0,
+        heads: int = 1,
     ) -> None:
         super().__init__()
         _check_choice("activation", activation, get_args(Activation))
         if context_dim < 1 or any(width < 1 for width in hidden):
             raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}")
+        if heads > 1 and not hidden:
+            raise ValueError("several heads need a hidden layer that they can have of their own, got hidden=[]")
         self.activation = activation
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
-            widths = (context_dim + other_dim, *hidden, output_dim)
+            widths = [context_dim + other_dim, *hidden]
+            widths[-1] *= heads if hidden else 1
             self.layers = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
+            if heads > 1:
+                self.layers.append(Heads(heads, hidden[-1], output_dim // heads))
+            else:
+                self.layers.append(nn.Linear(widths[-1], output_dim))
         self.register_buffer("context_mean", torch.zeros(context_dim))
         self.register_buffer("context_std", torch.ones(context_dim))
 
@@ -189,10 +219,10 @@ class ContextNetwork(nn.Module):
             value = getattr(torch, self.activation)(layer(value))
         return self.layers[-1](value)
 
-    def linear(self, index: int) -> nn.Linear:
+    def linear(self, index: int) -> "nn.Linear | Heads":
         """One of the layers, with its type."""
         layer = self.layers[index]
-        assert isinstance(layer, nn.Linear)
+        assert isinstance(layer, nn.Linear | Heads)
         return layer
 
     @torch.no_grad()
@@ -231,6 +261,8 @@ class NHT(LinearActionMap):
         lipschitz: Lipschitz constant of Q(c) that training keeps to, in the spectral norm and the raw
             context.
         lipschitz_norm: "spectral", or the stricter "frobenius", which the authors' code limits.
+        multi_head: let each reflection have a last hidden layer of its own, of the same width, and its own output
+            layer; the layers before are shared. Needs a hidden layer.
         seed: of the initial weights.
 
     Raises:
@@ -250,6 +282,7 @@ class NHT(LinearActionMap):
         normalise: bool = False,
         lipschitz: float | None = None,
         lipschitz_norm: NormKind = "spectral",
+        multi_head: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__(context_dim, actuation_dim, action_dim, lipschitz, lipschitz_norm)
@@ -258,8 +291,10 @@ class NHT(LinearActionMap):
         self.hidden = tuple(hidden)
         self.activation = activation
         self.normalise = normalise
+        self.multi_head = multi_head
         self.seed = seed
-        self.network = ContextNetwork(context_dim, action_dim * (actuation_dim - 1), hidden, activation, seed)
+        tangents, heads = action_dim * (actuation_dim - 1), action_dim if multi_head else 1
+        self.network = ContextNetwork(context_dim, tangents, hidden, activation, seed, heads=heads)
         # Tangents of length about 1. From tangents near 0, where all reflectors coincide, contexts can set out for
         # opposite sides of the sphere. The two parts then meet in a steep wall, which training cannot tear down:
         # such fits ended at 100 times the error of the others.

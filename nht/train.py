@@ -140,9 +140,8 @@ def _gradient_steps(
     limit = None
     if isinstance(map, LinearActionMap) and map.lipschitz is not None:
         limit = LipschitzProjection(map)
-    for step in range(1, max_steps + 1):
-        rows = torch.randint(len(data), (batch_size,), generator=generator)
-        loss = map.loss(data[rows])
+    for step, batch in enumerate(_batches(data, batch_size, max_steps, generator), start=1):
+        loss = map.loss(batch)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -153,6 +152,16 @@ def _gradient_steps(
             if limit is not None:
                 limit.exact()
             yield step, loss.item()
+
+
+def _batches(
+    data: TensorDictBase, batch_size: int, count: int, generator: torch.Generator
+) -> Iterator[TensorDictBase]:
+    """Yields batches of random rows; those of many steps are gathered at once, as each gathering has its price."""
+    for start in range(0, count, EVALUATE_EVERY):
+        steps = min(EVALUATE_EVERY, count - start)
+        rows = torch.randint(len(data), (steps, batch_size), generator=generator)
+        yield from data[rows].unbind(0)
 
 
 def _keep_best(

@@ -39,6 +39,7 @@ class MapConfig:
     action_dim: int = 2
     hidden: list[int] = field(default_factory=lambda: [256, 256])
     activation: str = "tanh"
+    multi_head: bool = False  # nht: each reflection has a last hidden layer of its own
     lipschitz: float | None = None  # bound L on the whole map; None leaves it free
     learning_rate: float = 1e-3
     batch_size: int = 256

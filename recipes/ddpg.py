@@ -83,7 +83,7 @@ def main(config: DDPG) -> None:
         run.rewind(counters.frames)
 
     progress = run.progress_bar(algo.total_frames, counters.frames)
-    training = TrainingStatistics()
+    training = TrainingStatistics(env.base_env.action_spec.space)
     for data in collector:
         data = charge_failure(data.reshape(-1), algo.gamma)
         features.module.update(data["observation"])

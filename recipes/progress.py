@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
+from torchrl.data.tensor_specs import ContinuousBox
 
 
 @dataclass
@@ -44,14 +45,19 @@ class CollectorState:
 
 
 class TrainingStatistics:
-    """Means since the last evaluation: losses, and outcomes of the episodes that ended in training."""
+    """Means since the last evaluation: losses, outcomes of the episodes that ended, and how actuations fared.
 
-    def __init__(self) -> None:
+    Args:
+        bounds: the actuation's space in the environment, which clips at its ``low`` and ``high``, ``(*batch, n)``.
+    """
+
+    def __init__(self, bounds: ContinuousBox) -> None:
+        self._low, self._high = (bound.reshape(-1, bound.shape[-1])[0] for bound in (bounds.low, bounds.high))
         self._clear()
 
     def _clear(self) -> None:
         self._sums: dict[str, torch.Tensor | float] = defaultdict(float)
-        self._updates = self._episodes = 0
+        self._updates = self._episodes = self._steps = 0
 
     def add_losses(self, losses: TensorDictBase) -> None:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
@@ -60,9 +66,11 @@ class TrainingStatistics:
             self._sums[name] = self._sums[name] + value.detach()
 
     def add_steps(self, steps: TensorDictBase) -> None:
-        """Count the episodes that end among ``(T,)`` collected steps, and copies that diverged."""
+        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations."""
         outcome = steps["next"]
-        done = outcome["done"]
+        done, actuation = outcome["done"], outcome["actuation"]
+        self._steps += len(steps)
+        self._sums["clipped"] += float(((actuation <= self._low) | (actuation >= self._high)).any(-1).sum())
         self._episodes += int(done.sum())
         for name in ("success", "failure"):
             self._sums[name] += float((outcome[name] & done).sum())
@@ -83,7 +91,8 @@ class TrainingStatistics:
         row = {
             "train_success": self._sums["success"] / episodes,
             "train_failure": self._sums["failure"] / episodes,
-            "diverged": self._sums["diverged"],
+            "diverged": self._sums["diverged"],  # a count: each one is a failure of map, policy or physics
+            "clipped": self._sums["clipped"] / (self._steps or float("nan")),  # steps with a motor at its limit
             "loss_actor": float(self._sums["loss_actor"]) / updates,
             "loss_value": float(self._sums["loss_value"]) / updates,
         }

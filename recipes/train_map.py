@@ -92,8 +92,8 @@ def make_map(
         env: the task; only the kind "jacobian" asks what arm it has.
 
     Raises:
-        ValueError: for an unknown kind; the message lists those that exist. For a Lipschitz limit that the kind
-            cannot keep to, or a Jacobian where there is no arm.
+        ValueError: for an unknown kind; the message lists those that exist. For a Lipschitz limit or several heads
+            that the kind cannot have, or a Jacobian where there is no arm.
     """
     _check_kind(map.kind)
     if map.kind == "none":
@@ -105,12 +105,15 @@ def make_map(
     sizes = (context_dim, actuation_dim, map.action_dim, map.hidden, cast(Activation, map.activation))
     if map.lipschitz is not None and map.kind in ("laser", "cae"):
         raise ValueError(f"map.lipschitz limits nht and scl, there is no limit for {map.kind!r}.")
+    if map.multi_head and map.kind != "nht":
+        raise ValueError(f"map.multi_head is an option of nht, {map.kind!r} has no heads.")
     if map.kind == "laser":
         return nht.LASER(*sizes, beta_kl=map.beta_kl, beta_dynamics=map.beta_dynamics, seed=seed)
     if map.kind == "cae":
         return nht.CAE(*sizes, seed=seed)
-    linear = nht.SCL if map.kind == "scl" else nht.NHT
-    return linear(*sizes, lipschitz=map.lipschitz, seed=seed)
+    if map.kind == "scl":
+        return nht.SCL(*sizes, lipschitz=map.lipschitz, seed=seed)
+    return nht.NHT(*sizes, lipschitz=map.lipschitz, multi_head=map.multi_head, seed=seed)
 
 
 def _jacobian(env: EnvConfig) -> nht.JacobianPinv:

@@ -21,6 +21,8 @@ def wild(activation: Activation = "tanh", **options: object) -> nht.NHT:
     with torch.no_grad():
         for layer in map.network.layers:
             layer.weight.mul_(20)
+        if map.multi_head:
+            map.network.layers[-1].weight[0].mul_(3)
         map.network.context_mean.uniform_(-1, 1, generator=generator)
         map.network.context_std.uniform_(0.1, 2, generator=generator)
     return map
@@ -38,13 +40,39 @@ def largest_ratio(map: nht.NHT, distance: float) -> float:
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("limit", [None, 0.5, 3.0])
-def test_no_pair_of_contexts_exceeds_the_certificate(activation: Activation, limit: float | None) -> None:
-    map = wild(activation, lipschitz=limit)
+@pytest.mark.parametrize("multi_head", [False, True])
+def test_no_pair_of_contexts_exceeds_the_certificate(
+    activation: Activation, limit: float | None, multi_head: bool
+) -> None:
+    map = wild(activation, lipschitz=limit, multi_head=multi_head)
     if limit is not None:
         LipschitzProjection(map)
         assert certificate(map) <= limit
     for distance in (1e-5, 1e-2, 1.0):
         assert 0 < largest_ratio(map, distance) <= certificate(map)
+
+
+@pytest.fixture(scope="module")
+def demos() -> nht.Demos:
+    """Actuations on a plane that turns fast with the context: fits run into a limit of 2."""
+    generator = torch.Generator().manual_seed(0)
+    context = torch.randn(2000, CONTEXT_DIM, generator=generator)
+    action = torch.randn(2000, 3, generator=generator)
+    with torch.no_grad():
+        actuation = wild().float()(action, context)
+    return nht.Demos.from_tensors(actuation=actuation, context=context, episode=torch.arange(2000) // 50)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("multi_head", [False, True])
+def test_trained_maps_keep_the_bound_of_eq_22(
+    demos: nht.Demos, activation: Activation, multi_head: bool
+) -> None:
+    map = nht.NHT(CONTEXT_DIM, 7, 3, (24, 24), activation, lipschitz=2.0, multi_head=multi_head)
+    metrics = nht.train_map(demos, map, max_steps=300, learning_rate=1e-2).metrics
+    assert 1.5 < metrics["certificate"] == certificate(map) <= 2.0
+    for distance in (1e-4, 1e-2, 1.0):
+        assert 0 < largest_ratio(map.double(), distance) <= certificate(map)
 
 
 @torch.no_grad()

@@ -46,6 +46,7 @@ def every_map() -> list[ActionMap]:
         nht.NHT(CONTEXT_DIM, 7, 2, hidden=(16,)),
         nht.NHT(CONTEXT_DIM, 7, 3, hidden=(), activation="relu"),
         nht.NHT(CONTEXT_DIM, 3, 3, hidden=(8, 8, 8), activation="sigmoid", normalise=True),
+        nht.NHT(CONTEXT_DIM, 6, 4, hidden=(16, 8), multi_head=True),
         trained_svd,
         nht.Identity(7, CONTEXT_DIM),
         nht.SCL(CONTEXT_DIM, 7, 3, hidden=(16,), normalise=True),
@@ -148,6 +149,24 @@ def test_the_seed_alone_decides_the_initial_weights() -> None:
     assert not torch.equal(first["network.layers.0.weight"], other["network.layers.0.weight"])
 
 
+def test_heads_are_one_layer_with_a_block_diagonal_matrix() -> None:
+    map = nht.NHT(CONTEXT_DIM, 6, 3, hidden=(16, 8), multi_head=True).double()
+    heads = map.network.linear(-1)
+    assert map.network.linear(-2).weight.shape == (3 * 8, 16)
+    hidden = normal(5, 3 * 8)
+    dense = hidden @ torch.block_diag(*heads.weight).mT + heads.bias.flatten()
+    torch.testing.assert_close(heads(hidden), dense)
+
+
+def test_each_head_moves_its_own_reflector_alone() -> None:
+    map = nht.NHT(CONTEXT_DIM, 6, 3, hidden=(16, 8), multi_head=True).double()
+    before = map.reflectors(normal(5, CONTEXT_DIM))
+    with torch.no_grad():
+        map.network.linear(-2).weight[8:16].add_(1)  # the last hidden layer of the second head
+    after = map.reflectors(normal(5, CONTEXT_DIM))
+    assert [bool((before[:, i] != after[:, i]).any()) for i in range(3)] == [False, True, False]
+
+
 def test_the_normaliser_centres_and_scales_but_does_not_amplify_what_hardly_moves() -> None:
     context = normal(500, CONTEXT_DIM) * torch.tensor([5.0, 1.0, 1e-6, 0.0]) + 3
     network = ContextNetwork(CONTEXT_DIM, 2, (8,), "tanh", seed=0).double()
@@ -188,6 +207,7 @@ def test_maps_compile_into_one_graph(map: ActionMap) -> None:
         (lambda: nht.NHT(0, 7, 2), "widths must be at least 1, got context_dim=0"),
         (lambda: nht.SVD(7, 2, -1), "context_dim must be 0 or more, got -1"),
         (lambda: nht.NHT(4, 7, 2, hidden=(16, 0)), r"hidden=\[16, 0\]"),
+        (lambda: nht.NHT(4, 7, 2, hidden=(), multi_head=True), "need a hidden layer that they can have of"),
         (
             lambda: nht.NHT(4, 7, 2, activation="gelu"),
             "activation must be one of relu, sigmoid, tanh, got 'gelu'",

@@ -277,6 +277,17 @@ def test_a_jacobian_without_an_arm():
         train_map.make_map(config.map, 10, 7, 0, wide)
 
 
+def test_heads_for_a_map_that_has_none():
+    config = configure(TrainMap, "train_map", ["map=scl", "map.multi_head=true", "out=unused"])
+    with pytest.raises(ValueError, match=r"map.multi_head is an option of nht, 'scl' has no heads"):
+        train_map.make_map(config.map, 10, 7, seed=0)
+
+
+def test_heads_reach_the_map():
+    config = configure(TrainMap, "train_map", ["map=nht", "map.multi_head=true", "out=unused"])
+    assert train_map.make_map(config.map, 10, 7, seed=0).init_args()["multi_head"] is True
+
+
 def test_a_lipschitz_limit_for_a_map_that_has_none():
     config = configure(TrainMap, "train_map", ["map=laser", "map.lipschitz=2", "out=unused"])
     with pytest.raises(ValueError, match=r"map.lipschitz limits nht and scl, there is no limit for 'laser'"):

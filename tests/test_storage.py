@@ -46,6 +46,7 @@ def trained(map: ActionMap) -> ActionMap:
 MAPS: dict[str, Callable[[], ActionMap]] = {
     "nht": lambda: nht.NHT(10, 7, 2, (16, 8), "sigmoid", normalise=True, lipschitz=4.0, seed=3),
     "double": lambda: nht.NHT(10, 7, 3, hidden=()).double(),
+    "nht with heads": lambda: nht.NHT(10, 7, 3, (16, 8), multi_head=True),
     "scl": lambda: nht.SCL(10, 7, 2, (16, 8), "relu", lipschitz=4.0),
     "svd": lambda: nht.SVD(7, 2, 10),
     "identity": lambda: nht.Identity(7),
@@ -186,7 +187,12 @@ def test_safetensors_files_of_others_are_refused(path: Path) -> None:
         ({"header": {"map": "{}"}}, "its description is damaged: 'class'"),
         ({"description": {"class": "Unheard"}}, "unknown class 'Unheard'; known are .*Identity.*NHT.*SVD"),
         (
-            {"description": {"class": "SCL"}},
+            {
+                "description": {
+                    "class": "SCL",
+                    "init_args": {"context_dim": 10, "actuation_dim": 7, "action_dim": 2, "hidden": [16]},
+                }
+            },
             r"do not fit SCL: network.layers.1.weight is .* \(12, 16\), .* \(14, 16\)",
         ),
         (

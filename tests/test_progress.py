@@ -1,0 +1,45 @@
+"""What a run counts between two evaluations."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+
+from nht.recipes.progress import TrainingStatistics
+
+BOUNDS = Bounded(low=torch.tensor([[-1.0, -2.0]] * 3), high=torch.tensor([[1.0, 2.0]] * 3)).space
+
+
+def steps(actuation: list[list[float]], done: list[bool]) -> TensorDict:
+    count = len(actuation)
+    flag = torch.zeros(count, 1, dtype=torch.bool)
+    outcome = {name: flag.clone() for name in ("success", "failure", "diverged")}
+    outcome |= {"done": torch.tensor(done)[:, None], "actuation": torch.tensor(actuation)}
+    return TensorDict({"next": outcome}, batch_size=count).unflatten_keys()
+
+
+def test_actuations_at_the_motors_limits_are_counted() -> None:
+    statistics = TrainingStatistics(BOUNDS)
+    data = steps([[0.5, 1.9], [1.0, 0.0], [0.0, -2.0], [-0.99, 1.0]], done=[False] * 4)
+    statistics.add_steps(data)
+    assert statistics.take()["clipped"] == 0.5
+    assert math.isnan(statistics.take()["clipped"])  # starts anew
+
+
+def test_outcomes_are_means_over_the_episodes_that_ended() -> None:
+    statistics = TrainingStatistics(BOUNDS)
+    data = steps([[0.0, 0.0]] * 4, done=[True, False, True, False])
+    data["next", "success"][:] = torch.tensor([[True], [True], [False], [False]])
+    data["next", "diverged"][3] = True
+    statistics.add_steps(data)
+    row = statistics.take()
+    assert (row["train_success"], row["train_failure"], row["diverged"]) == (0.5, 0, 1)
+
+
+def test_a_loss_that_is_no_number_ends_the_training() -> None:
+    statistics = TrainingStatistics(BOUNDS)
+    statistics.add_losses(TensorDict({"loss_actor": torch.tensor(torch.nan)}))
+    with pytest.raises(FloatingPointError, match="loss_actor is nan: training diverged"):
+        statistics.take()
