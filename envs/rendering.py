@@ -7,13 +7,16 @@ import importlib
 import os
 import sys
 import weakref
+from itertools import pairwise
 
 import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
-from nht.envs.task import BatchedTask
+from nht.envs.task import Array, BatchedTask
+
+LINE = np.array([0.15, 0.35, 0.85, 0.9], dtype=np.float32)  # red, green, blue, opacity
 
 
 class SceneRenderer:
@@ -44,18 +47,37 @@ class SceneRenderer:
         # At exit MuJoCo ends EGL; what the collector frees after that prints a traceback.
         atexit.register(_close, weakref.ref(self._renderer))
 
-    def frame(self, row: int = 0) -> NDArray[np.uint8]:
-        """The copy ``row`` as it stands now, ``(height, width, 3)``."""
+    def frame(self, row: int = 0, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The copy ``row`` as it stands now, ``(height, width, 3)``.
+
+        Args:
+            row: which copy.
+            trail: points ``(T, 3)`` to draw a line through, for example where the tool has been.
+        """
         full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
         mujoco.mj_setState(self.task.model, self._data, self.task.state[row], full_physics)
         mujoco.mj_forward(self.task.model, self._data)
         self._renderer.update_scene(self._data, camera=self.camera)
         self.task.decorate(self._renderer.scene, row)
+        if trail is not None:
+            _draw_line(self._renderer.scene, trail)
         return self._renderer.render()
 
     def close(self) -> None:
         """Release the OpenGL context."""
         self._renderer.close()
+
+
+def _draw_line(scene: mujoco.MjvScene, points: Array, width: float = 3.0) -> None:
+    """Add a line [pixels wide] to the scene; of more points than it has room for, the last ones."""
+    room = scene.maxgeom - scene.ngeom
+    for start, end in list(pairwise(points))[-room:]:
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(
+            geom, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.zeros(3), np.eye(3).ravel(), LINE
+        )
+        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_LINE, width, start, end)
+        scene.ngeom += 1
 
 
 def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:

@@ -177,7 +177,7 @@ class Evaluate:
     episodes: int = 100
     seed: int = 1_000_000
     video: bool = True
-    video_episodes: int = 3
+    video_episodes: int = 6
     env_options: dict[str, Any] = field(default_factory=dict)  # laid over those of the run
 
 

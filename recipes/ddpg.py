@@ -14,12 +14,13 @@ from torchrl.objectives import SoftUpdate
 
 from nht.recipes.config import DDPG
 from nht.recipes.environments import mapped_env, run_map, test_env
-from nht.recipes.evaluation import evaluate, record_video
+from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
 from nht.recipes.losses import PaperDDPGLoss, charge_failure
 from nht.recipes.networks import ddpg_networks, exploring, save_policy
 from nht.recipes.progress import CollectorState, Counters, TrainingStatistics
 from nht.recipes.run_folder import RunFolder
+from nht.recipes.video import record_video
 
 VIDEO_EPISODES = 3
 STORED = (

@@ -13,10 +13,11 @@ from torchrl.envs import TransformedEnv
 import nht
 from nht.recipes.config import DDPG, Evaluate
 from nht.recipes.environments import mapped_env
-from nht.recipes.evaluation import evaluate, record_video
+from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
 from nht.recipes.networks import load_policy
 from nht.recipes.run_folder import read_config
+from nht.recipes.video import record_video
 
 
 def main(config: Evaluate) -> None:
@@ -39,7 +40,7 @@ def main(config: Evaluate) -> None:
     if config.video:
         video = folder / "evaluation.mp4"
         record_video(build(config.video_episodes), policy, video)
-        print(f"{video}")
+        print(f"{video}, {video.with_suffix('.png')}")
 
 
 if __name__ == "__main__":

@@ -92,7 +92,8 @@ class TrainingStatistics:
             "train_success": self._sums["success"] / episodes,
             "train_failure": self._sums["failure"] / episodes,
             "diverged": self._sums["diverged"],  # a count: each one is a failure of map, policy or physics
-            "clipped": self._sums["clipped"] / (self._steps or float("nan")),  # steps with a motor at its limit
+            "clipped": self._sums["clipped"]
+            / (self._steps or float("nan")),  # steps with a motor at its limit
             "loss_actor": float(self._sums["loss_actor"]) / updates,
             "loss_value": float(self._sums["loss_value"]) / updates,
         }

@@ -11,6 +11,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from fresh_process import DRAW, run
+
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
@@ -18,3 +20,9 @@ settings.load_profile("repeatable")
 @pytest.fixture(autouse=True)
 def _seeded():
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def can_render():
+    if all(run(DRAW, MUJOCO_GL=platform).returncode for platform in ("egl", "osmesa")):
+        pytest.skip("neither EGL nor OSMesa is installed")

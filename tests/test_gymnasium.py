@@ -1,9 +1,5 @@
 """Gymnasium's side of every task, and pictures of it."""
 
-import os
-import subprocess
-import sys
-
 import gymnasium
 import numpy as np
 import pytest
@@ -12,28 +8,10 @@ from gymnasium.utils.env_checker import check_env
 from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
+from fresh_process import run
 from nht.envs import GYMNASIUM_IDS, make_env
 from nht.envs.wam import GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT
 from nht.envs.wam_kinematics import tool_pose
-
-DRAW = """
-import mujoco
-with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16) as renderer:
-    renderer.render()
-"""
-
-
-def run(code, **variables):
-    """Run ``code`` in another process, without a display and with nothing said about OpenGL but ``variables``."""
-    inherited = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "MUJOCO_GL")}
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, env=inherited | variables, capture_output=True, text=True, timeout=200)
-
-
-@pytest.fixture(scope="session")
-def can_render():
-    if all(run(DRAW, MUJOCO_GL=platform).returncode for platform in ("egl", "osmesa")):
-        pytest.skip("neither EGL nor OSMesa is installed")
 
 
 @pytest.fixture(params=sorted(GYMNASIUM_IDS))

@@ -1,0 +1,124 @@
+"""Films of test episodes: a grid of copies, with the tool's trail and how each of them fares."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
+
+from nht.envs import BatchedTask
+from nht.envs.rendering import SceneRenderer
+from nht.recipes.evaluation import Evaluation, Policy, evaluate
+
+Picture = NDArray[np.uint8]
+
+TILE = (480, 360)  # width and height of one copy's picture [pixel]
+SMOOTH = 30  # frames per second that are enough
+TRAIL_EVERY = 4  # steps; each piece of a line costs time in software rendering
+SHEET_COLUMNS = 6  # moments of an episode on the contact sheet
+COLOURS = {"failed": (200, 40, 40), "success": (30, 150, 60), "": (120, 120, 120)}
+BORDER = 4  # pixels
+
+
+def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
+    """Write one episode of every copy of ``env`` as an MP4 at the speed of real time, and a contact sheet beside it.
+
+    A copy's tile has a trail of the tool, where the task has one, the time, and a border that says how the episode
+    stands: green for success, red for failure. The tile of an episode that has ended stands still.
+
+    Args:
+        env: a batched task behind any transforms.
+        policy: reads the observation, writes ``"action"``.
+        path: of the MP4; the contact sheet has the suffix ``.png``, a row per copy, from start to end.
+
+    Raises:
+        RuntimeError: if this machine cannot render offscreen.
+    """
+    film = Film(env.base_env.task)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        outcome = evaluate(env, policy, on_step=film.add)
+    finally:
+        film.close()
+    with imageio.get_writer(path, fps=film.frames_per_second, macro_block_size=8) as writer:
+        video: Any = writer  # its stub lacks append_data
+        for tiles in film.frames:
+            video.append_data(grid(tiles))
+    imageio.imwrite(path.with_suffix(".png"), contact_sheet(film.frames))
+    return outcome
+
+
+class Film:
+    """Takes pictures of all copies of a task, step by step.
+
+    Attributes:
+        frames: of every moment filmed, a picture ``(height, width, 3)`` per copy.
+        frames_per_second: at which the film runs at the speed of real time.
+    """
+
+    def __init__(self, task: BatchedTask) -> None:
+        self.task = task
+        self.frames: list[list[Picture]] = []
+        steps_per_second = 1 / (task.substeps * task.model.opt.timestep)
+        self._every = math.ceil(steps_per_second / SMOOTH)
+        self.frames_per_second = steps_per_second / self._every
+        self._renderer = SceneRenderer(task, *TILE)
+        self._trail: list[NDArray[np.float64]] = []
+        self._steps = 0
+        self._running = np.ones(task.num_envs, dtype=bool)
+
+    def add(self, outcome: TensorDictBase) -> None:
+        """Film what a reset or a step has brought, where it is time for a picture or an episode has ended."""
+        done, success, failure = (outcome[flag].view(-1).numpy() for flag in ("done", "success", "failure"))
+        if (tool := self.task.observe().get("tool_position")) is not None:
+            self._trail.append(tool)
+        if self._steps % self._every == 0 or (done & self._running).any():
+            self.frames.append([self._tile(row, success[row], failure[row]) for row in range(len(done))])
+        self._running &= ~done
+        self._steps += 1
+
+    def _tile(self, row: int, success: bool, failure: bool) -> Picture:
+        if not self._running[row]:
+            return self.frames[-1][row]
+        trail = np.stack([points[row] for points in self._trail[::TRAIL_EVERY]]) if self._trail else None
+        state = "failed" if failure else "success" if success else ""
+        picture = Image.fromarray(self._renderer.frame(row, trail))
+        seconds = self._steps * self.task.substeps * self.task.model.opt.timestep
+        draw = ImageDraw.Draw(picture)
+        draw.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=COLOURS[state], width=BORDER)
+        draw.text(
+            (12, 10),
+            f"{seconds:4.2f} s  {state}",
+            fill=(255, 255, 255),
+            stroke_width=2,
+            stroke_fill=(0, 0, 0),
+            font_size=18,
+        )
+        return np.asarray(picture)
+
+    def close(self) -> None:
+        """Release the renderer."""
+        self._renderer.close()
+
+
+def grid(tiles: list[Picture]) -> Picture:
+    """Pictures of one size side by side, in about as many rows as columns; white where there is none left."""
+    columns = math.ceil(math.sqrt(len(tiles)))
+    missing = -len(tiles) % columns
+    tiles = tiles + [np.full_like(tiles[0], 255)] * missing
+    rows = [np.concatenate(tiles[start : start + columns], axis=1) for start in range(0, len(tiles), columns)]
+    return np.concatenate(rows, axis=0)
+
+
+def contact_sheet(frames: list[list[Picture]]) -> Picture:
+    """A row per copy: moments of its film from start to end, at half size."""
+    moments = np.linspace(0, len(frames) - 1, SHEET_COLUMNS).round().astype(int)
+    columns = [np.concatenate([tile[::2, ::2] for tile in frames[moment]], axis=0) for moment in moments]
+    return np.concatenate(columns, axis=1)
