@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from nht.align import Aligned, align
 from nht.demos import Demos, load_demos, save_demos
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
@@ -19,12 +20,14 @@ __all__ = [
     "SCL",
     "SVD",
     "ActionMap",
+    "Aligned",
     "Demos",
     "Identity",
     "JacobianPinv",
     "LinearActionMap",
     "MapTraining",
     "Residual",
+    "align",
     "certificate",
     "load_demos",
     "load_map",

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from nht.align import Aligned
 from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap
 from nht.residual import Residual
 
@@ -27,11 +28,11 @@ def certificate(map: ActionMap) -> float:
     training kept to a limit or not.
 
     Returns:
-        Of a Residual the constant of the map inside, as corrections do not depend on the context. 0 for a basis
-        that ignores the context; infinity where none is known, as for a map that is not linear
-        in the action.
+        Of a Residual the constant of the map inside, as corrections do not depend on the context; of an Aligned
+        the same, as its rotation changes no norm. 0 for a basis that ignores the context; infinity where none is
+        known, as for a map that is not linear in the action.
     """
-    if isinstance(map, Residual):
+    if isinstance(map, Aligned | Residual):
         return certificate(map.map)
     if not isinstance(map, LinearActionMap):
         return math.inf

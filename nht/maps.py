@@ -97,6 +97,16 @@ class ActionMap(nn.Module, ABC):
         """The constructor's arguments, JSON values or other maps: they make an untrained twin."""
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
+    @torch.no_grad()
+    def take_over(self, map: "ActionMap") -> None:
+        """What another map learned about its demonstrations, and its precision and device: for maps that wrap it."""
+        self.context_keys = map.context_keys
+        self.data_fingerprint = map.data_fingerprint
+        self.to(map.action_scale)
+        self.action_scale.copy_(map.action_scale)
+        self.actuation_low.copy_(map.actuation_low)
+        self.actuation_high.copy_(map.actuation_high)
+
 
 class LinearActionMap(ActionMap):
     """An action map that is linear in the action: u = Q(c) a.

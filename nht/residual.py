@@ -40,13 +40,7 @@ class Residual(ActionMap):
         self.action_dim = map.action_dim + map.actuation_dim  # k + n: corrections make it more than n
         self.map = map
         self.scale = scale
-        self.context_keys = map.context_keys
-        self.data_fingerprint = map.data_fingerprint
-        self.to(map.action_scale)
-        with torch.no_grad():
-            self.action_scale.copy_(map.action_scale)
-            self.actuation_low.copy_(map.actuation_low)
-            self.actuation_high.copy_(map.actuation_high)
+        self.take_over(map)
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
         """map(a) + scale r."""

@@ -1,4 +1,4 @@
-"""Action maps side by side: each is trained on the same demonstrations, then measured.
+"""Action maps side by side: each is trained on the same demonstrations, then measured and drawn.
 
 python -m nht.recipes.compare_maps demos.path=runs/demos-wam_wipe maps=[nht,laser,svd,scl] action_dims=[1,2,3]
 """
@@ -19,17 +19,30 @@ import pandas
 import torch
 
 import nht
-from nht.recipes.config import CompareMaps, EnvConfig
+from nht.recipes.config import CompareMaps
 from nht.recipes.launch import launch
-from nht.recipes.train_map import KINDS, train_map
+from nht.recipes.map_figures import basis_figure, tool_figure
+from nht.recipes.train_map import ARMS, KINDS, arm_of, train_map
 
 FIXED = ("jacobian", "none")  # kinds whose action has the width it has
-PAIRS = 5_000  # of contexts, to see how fast a basis changes
+PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
+
+HEADINGS = {
+    "validation_error": "held-out error",
+    "largest_ratio": "largest seen ratio",
+    "training_seconds": "trained in [s]",
+    "latency_1_us": "latency, batch 1 [us]",
+    "latency_4096_us": "batch 4096 [us]",
+}
 
 
 def main(config: CompareMaps) -> None:
-    """Train and measure every map; write ``table.csv``, ``table.md`` and ``error.png``, and print the table."""
+    """Train and measure every map; write the table, the figures and the maps, and print the table.
+
+    The folder gets ``table.csv`` and ``table.md``; ``error.png``; for ``map.action_dim`` axes ``basis.png`` and, for
+    the task of an arm, ``tool.png``; and every map, in ``maps/``.
+    """
     out = Path(config.out)
     if out.exists():
         raise FileExistsError(f"{out} exists: comparisons are never overwritten. Choose another folder.")
@@ -39,30 +52,40 @@ def main(config: CompareMaps) -> None:
         raise ValueError(f"unknown map kinds {sorted(unknown)}: choose from {sorted(KINDS)}.")
     if not config.maps or not config.action_dims:
         raise ValueError(f"nothing to compare: got maps={config.maps} and action_dims={config.action_dims}.")
-    rows = []
+    demos = nht.load_demos(config.demos.path, env=config.env.name)
+    rows, maps = [], {}
     for kind in config.maps:
         for action_dim in config.action_dims[:1] if kind in FIXED else config.action_dims:
-            rows.append({"map": kind, **_measured(config, kind, action_dim)})
+            trained = _trained(config, kind, action_dim)
+            maps[kind, trained.map.action_dim] = trained.map
+            rows.append({"map": kind, "k": trained.map.action_dim, **_measured(trained, demos)})
     table = pandas.DataFrame(rows)
     out.mkdir(parents=True)
     table.to_csv(out / "table.csv", index=False)
     (out / "table.md").write_text(_markdown(table))
+    for (kind, k), map in maps.items():
+        nht.save_map(map, out / "maps" / f"{kind}-k{k}.safetensors")
     _plot(table, out / "error.png")
+    _draw(config, maps, demos, out)
     print((out / "table.md").read_text())
     print(f"saved in {out}")
 
 
-def _measured(config: CompareMaps, kind: str, action_dim: int) -> dict[str, float]:
+def _trained(config: CompareMaps, kind: str, action_dim: int) -> nht.MapTraining:
     env = config.env
     if kind == "jacobian":
         env = replace(env, context_keys=["joint_angle"])
     settings = replace(config.map, kind=kind, action_dim=action_dim)
-    map, metrics = train_map(settings, env, config.demos, config.seed)
+    return train_map(settings, env, config.demos, config.seed)
+
+
+def _measured(trained: nht.MapTraining, demos: nht.Demos) -> dict[str, float]:
+    map, metrics = trained
+    context = demos.context(map.context_keys or ())[: PAIRS + 1]
     return {
-        "k": map.action_dim,
         "validation_error": metrics["validation_error"],
         "certificate": metrics["certificate"],
-        "largest_ratio": _largest_ratio(map, config.demos.path or "", env),
+        "largest_ratio": largest_ratio(map, context),
         "parameters": sum(weight.numel() for weight in map.parameters()),
         "training_seconds": metrics["seconds"],
         "latency_1_us": 1e6 * latency(map, 1),
@@ -71,13 +94,27 @@ def _measured(config: CompareMaps, kind: str, action_dim: int) -> dict[str, floa
 
 
 @torch.no_grad()
-def _largest_ratio(map: nht.ActionMap, path: str, env: EnvConfig) -> float:
-    """The largest |Q(c) - Q(c')| / |c - c'| seen, between neighbours in time: NaN for maps without a basis."""
-    if not isinstance(map, nht.LinearActionMap):
-        return float("nan")
-    context = nht.load_demos(path).context(env.context_keys)[: PAIRS + 1]
-    basis = map.basis(context)
-    change = torch.linalg.matrix_norm(basis[1:] - basis[:-1], ord=2)
+def largest_ratio(map: nht.ActionMap, context: torch.Tensor) -> float:
+    """How fast the interface changes with the context, at most, between neighbours in time.
+
+    Of a linear map the largest |Q(c) - Q(c')| / |c - c'|, in the spectral norm. Of any other, which has no basis, the
+    largest |u(a, c) - u(a, c')| / (|a| |c - c'|) for the fixed actions a of plus and minus `action_scale` on an axis.
+
+    Args:
+        map: any map.
+        context: (T, context_dim), in order of time.
+
+    Returns:
+        NaN if the context never changes.
+    """
+    if isinstance(map, nht.LinearActionMap):
+        basis = map.basis(context)
+        change = torch.linalg.matrix_norm(basis[1:] - basis[:-1], ord=2)
+    else:
+        axes = torch.eye(map.action_dim)
+        actions = map.action_scale * torch.cat([axes, -axes])
+        actuation = torch.stack([map(action.expand(len(context), -1), context) for action in actions])
+        change = (actuation[:, 1:] - actuation[:, :-1]).norm(dim=-1).amax(0) / map.action_scale
     distance = (context[1:] - context[:-1]).norm(dim=-1)
     moved = distance > 1e-3  # below, a ratio is mostly rounding
     return float((change / distance)[moved].max()) if moved.any() else float("nan")
@@ -96,26 +133,51 @@ def latency(map: nht.ActionMap, batch: int) -> float:
     return statistics.median(times[len(times) // 4 :])
 
 
+def _draw(
+    config: CompareMaps, maps: dict[tuple[str, int], nht.ActionMap], demos: nht.Demos, out: Path
+) -> None:
+    """The figures of the maps with ``map.action_dim`` axes, or else the first of ``action_dims``."""
+    dims = config.action_dims
+    axes = config.map.action_dim if config.map.action_dim in dims else dims[0]
+    chosen = {kind: map for (kind, k), map in maps.items() if k == axes or kind in FIXED}
+    with_columns = {kind: map for kind, map in chosen.items() if kind not in FIXED}
+    if with_columns:
+        longest = int(demos.episode.bincount().argmax())
+        basis_figure(with_columns, demos, longest, out / "basis.png")
+    if config.env.name in ARMS:
+        tool_figure(chosen, demos, arm_of(config.env.name), axes, out / "tool.png")
+
+
 def _markdown(table: pandas.DataFrame) -> str:
-    lines = ["| " + " | ".join(table.columns) + " |", "|" + "---|" * len(table.columns)]
+    headings = [HEADINGS.get(column, column) for column in table.columns]
+    lines = ["| " + " | ".join(headings) + " |", "|" + "---|" * len(headings)]
     for row in table.itertuples(index=False):
-        cells = [
-            "-" if value != value else f"{value:.4g}" if not isinstance(value, str) else value
-            for value in row
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
+        lines.append("| " + " | ".join(map(_cell, row)) + " |")
     return "\n".join(lines) + "\n"
 
 
+def _cell(value: str | float) -> str:
+    if isinstance(value, str):
+        return value
+    if value != value:
+        return "-"
+    return f"{value:,.0f}" if 1000 <= value < float("inf") else f"{value:.3g}"
+
+
 def _plot(table: pandas.DataFrame, path: Path) -> None:
+    """Error against k. Maps without any error have no place on a logarithmic axis; the legend names them."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for kind, rows in table.groupby("map", sort=False):
-        axes.plot(rows["k"], rows["validation_error"].clip(lower=1e-9), marker="o", label=str(kind))
-    axes.set(xlabel="action dimensions k", ylabel="held-out error |u - û|² / |u|²", yscale="log")
+        error = rows["validation_error"].where(rows["validation_error"] > 0)
+        label = str(kind) if error.notna().any() else f"{kind} (k = {rows['k'].iloc[0]}): exact"
+        axes.plot(rows["k"], error, marker="o", label=label)
+    axes.set(
+        xlabel="action dimensions k", ylabel="held-out error: share of |u|² that is missed", yscale="log"
+    )
     axes.set_xticks(sorted(table["k"].unique()))
     axes.grid(alpha=0.3)
-    axes.legend()
-    figure.savefig(path, dpi=150)
+    figure.legend(loc="outside right upper", frameon=False)
+    figure.savefig(path, dpi=100)
     plt.close(figure)
 
 

@@ -134,9 +134,15 @@ class TrainMap:
     env: EnvConfig = field(default_factory=EnvConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
     map: MapConfig = field(default_factory=MapConfig)
+    align: str | None = None  # tool: action axis 1 moves the arm's tool along x, 2 along y, 3 along z
     seed: int = 0
     device: str = "cpu"
     out: str = ""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an alignment that does not exist."""
+        if self.align not in (None, "tool"):
+            raise ValueError(f"align must be tool, or null for axes as they come out, got {self.align!r}.")
 
 
 @dataclass

@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
 
+import torch
 from tqdm import tqdm
 
 import nht
@@ -39,7 +40,7 @@ def main(config: TrainMap) -> None:
     out = Path(config.out)
     if out.exists():
         raise FileExistsError(f"{out} exists: maps are never overwritten. Choose another file.")
-    trained = train_map(config.map, config.env, config.demos, config.seed, config.device)
+    trained = train_map(config.map, config.env, config.demos, config.seed, config.device, align=config.align)
     nht.save_map(trained.map, out)
     for name, value in trained.metrics.items():
         print(f"{name:>20}  {value:.6g}")
@@ -47,12 +48,22 @@ def main(config: TrainMap) -> None:
 
 
 def train_map(
-    map: MapConfig, env: EnvConfig, demos: DemosConfig, seed: int, device: str = "cpu"
+    map: MapConfig,
+    env: EnvConfig,
+    demos: DemosConfig,
+    seed: int,
+    device: str = "cpu",
+    *,
+    align: str | None = None,
 ) -> nht.MapTraining:
     """Train the map that ``map`` describes; without a folder of demonstrations the expert gives them.
 
+    With ``align="tool"`` its axes are then turned to the motion of the arm's tool: 1 is along +x, 2 along +y, 3 along
+    +z, on average over the demonstrations; 4, 5 and 6 turn it about x, y and z.
+
     Raises:
-        ValueError: for an unknown kind of map, or demonstrations of another task.
+        ValueError: for an unknown kind of map, or demonstrations of another task; for an alignment without a known
+            arm, or of a map that is not linear or has more than six axes.
     """
     with TemporaryDirectory() as scratch:
         if demos.path is None:
@@ -60,6 +71,9 @@ def train_map(
         else:
             data = nht.load_demos(demos.path, env=env.name)
         context_dim = data.context(env.context_keys).shape[-1]
+        untrained = make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device)
+        if align is not None:
+            _check_alignable(untrained, env.name)
         with tqdm(total=map.max_steps, desc=f"map {map.kind}", unit="step", unit_scale=True) as bar:
 
             def show(metrics: dict[str, float]) -> None:
@@ -68,7 +82,7 @@ def train_map(
 
             trained = nht.train_map(
                 data,
-                make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device),
+                untrained,
                 context_keys=env.context_keys,
                 batch_size=map.batch_size,
                 learning_rate=map.learning_rate,
@@ -76,7 +90,9 @@ def train_map(
                 seed=seed,
                 progress=show,
             )
-    return trained._replace(map=_with_corrections(trained.map, map.residual))
+        finished = trained.map if align is None else _tool_aligned(trained.map, data, env.name)
+    metrics = trained.metrics | {"action_scale": float(finished.action_scale)}
+    return nht.MapTraining(_with_corrections(finished, map.residual), metrics)
 
 
 def make_map(
@@ -125,8 +141,35 @@ def _jacobian(env: EnvConfig) -> nht.JacobianPinv:
         raise ValueError(
             f"map.kind 'jacobian' needs env.context_keys=[joint_angle], as map=jacobian sets, got {env.context_keys}."
         )
-    arm = ARMS[env.name]
+    return arm_of(env.name)
+
+
+def arm_of(task: str) -> nht.JacobianPinv:
+    """How the joints of a task's arm move its tool; ``task`` must be one of ``ARMS``."""
+    arm = ARMS[task]
     return nht.JacobianPinv(arm.A.tolist(), (arm.QUARTER_TURNS * math.pi / 2).tolist(), arm.D.tolist())
+
+
+def _check_alignable(map: nht.ActionMap, task: str) -> None:
+    if task not in ARMS:
+        raise ValueError(f"align=tool needs an arm's kinematics: {sorted(ARMS)} have one, {task!r} does not.")
+    if not isinstance(map, nht.LinearActionMap) or map.action_dim > 6:
+        raise ValueError(
+            f"align=tool needs a linear map of at most 6 axes, got {type(map).__name__} with {map.action_dim}."
+        )
+
+
+@torch.no_grad()
+def _tool_aligned(map: nht.ActionMap, demos: nht.Demos, task: str) -> nht.ActionMap:
+    assert isinstance(map, nht.LinearActionMap)
+    context, joint_angle, actuation = (
+        value.to(map.action_scale)
+        for value in (demos.context(map.context_keys or ()), demos.data["joint_angle"], demos.actuation)
+    )
+    directions = torch.eye(6, map.action_dim)
+    aligned = nht.align(map, directions, context, jacobian=arm_of(task).jacobian(joint_angle))
+    aligned.action_scale.copy_(aligned.project(actuation, context).abs().max())
+    return aligned
 
 
 def load_kind(path: str | Path, kind: str, residual: float | None = None) -> nht.ActionMap:
@@ -142,9 +185,11 @@ def load_kind(path: str | Path, kind: str, residual: float | None = None) -> nht
         core = map.map
         if map.scale != residual:
             raise ValueError(f"{path} holds a map with residual {map.scale}, but map.residual is {residual}.")
+    if isinstance(core, nht.Aligned):
+        core = core.map
     if type(core) is not KINDS[kind]:
         raise ValueError(f"{path} holds a {type(core).__name__}, but map.kind is {kind!r}.")
-    return map if map is not core else _with_corrections(map, residual)
+    return map if isinstance(map, nht.Residual) else _with_corrections(map, residual)
 
 
 def _with_corrections(map: nht.ActionMap, residual: float | None) -> nht.ActionMap:

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 import nht
-from nht.recipes import collect_demos, compare_maps, ddpg, evaluate, report, train_map
-from nht.recipes.config import DDPG, CollectDemos, CompareMaps, Evaluate, Report, TrainMap
+from nht.recipes import collect_demos, ddpg, evaluate, report, train_map
+from nht.recipes.config import DDPG, CollectDemos, Evaluate, Report, TrainMap
 from nht.recipes.launch import configure
 
 TINY = [
@@ -121,36 +121,6 @@ def test_the_papers_settings_run(map_file, tmp_path):
     metrics = train(tmp_path / "run", map_file, "algo=ddpg_paper", "algo.updates_per_batch=45")
     assert metrics["updates"].tolist() == [4 * 45, 9 * 45]
     assert metrics["loss_value"].notna().all()
-
-
-def test_compare_maps_makes_a_table_and_a_figure(demos, tmp_path):
-    out, kinds = tmp_path / "out", ["nht", "laser", "cae", "svd", "scl", "jacobian", "none"]
-    common = [
-        f"demos.path={demos}",
-        "map.max_steps=250",
-        "map.hidden=[16]",
-        "action_dims=[1,2]",
-        f"out={out}",
-    ]
-    compare_maps.main(configure(CompareMaps, "compare_maps", [*common, f"maps={kinds}"]))
-    table = pandas.read_csv(out / "table.csv").set_index(["map", "k"])
-    assert len(table) == 5 * 2 + 2
-    assert table.loc[("svd", 2), "validation_error"] < table.loc[("svd", 1), "validation_error"]
-    assert table.loc[("none", 7), ["validation_error", "parameters"]].tolist() == [0, 0]
-    proven = table[table["certificate"] < float("inf")]
-    assert (proven["largest_ratio"] <= proven["certificate"]).all()
-    assert (table[["latency_1_us", "latency_4096_us", "training_seconds"]] > 0).all(axis=None)
-    assert "| laser | 2 |" in (out / "table.md").read_text()
-    assert iio.imread(out / "error.png").ndim == 3
-    with pytest.raises(FileExistsError, match="never overwritten"):
-        compare_maps.main(configure(CompareMaps, "compare_maps", common))
-    for override, message in (
-        ("maps=[nht,pca]", r"unknown map kinds \['pca'\]: choose from \['cae', "),
-        ("maps=[]", r"nothing to compare: got maps=\[\]"),
-        ("demos.path=null", r"demos.path must name the demonstrations"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            compare_maps.main(configure(CompareMaps, "compare_maps", [*common, "out=unused", override]))
 
 
 def test_any_map_can_have_corrections(demos, map_file, tmp_path):

@@ -1,0 +1,192 @@
+"""What a map does, to be looked at: its basis along a demonstration, and where its axes move the tool of an arm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display is needed
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.func import jacfwd, vmap
+
+import nht
+
+GRID = 9  # arrows along the longer side of the area where the tool was
+STEEP = Normalize(-0.1, 0.1)  # the vertical share of a motion within which its colour changes
+SLOPES = LinearSegmentedColormap.from_list("slopes", ["#1a73e8", "#202020", "#e8331a"])
+"""Blue for down, black for level, red for up."""
+
+
+def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: int, path: str | Path) -> None:
+    """The bases of maps along a demonstration: beside each other the maps, below each other their columns.
+
+    A panel has a line for each motor. What stands for the basis of a map that is not linear is said at `local_basis`.
+
+    Args:
+        maps: trained maps, by the name to show.
+        demos: demonstrations that have the maps' context keys.
+        episode: which of them.
+        path: of the PNG file.
+
+    Raises:
+        ValueError: if there is no such episode, or a map is not trained.
+    """
+    rows = demos.episode == episode
+    if not rows.any():
+        raise ValueError(f"there is no episode {episode}: the last is {int(demos.episode.max())}")
+    actuation = demos.actuation[rows]
+    axes = max(map.action_dim for map in maps.values())
+    figure, panels = _panels(axes, len(maps), width=2.6, height=2.1, sharex=True)
+    for (name, map), column in zip(maps.items(), panels.T, strict=True):
+        basis = local_basis(map, demos.context(_keys(map))[rows], actuation)
+        reach = 1.1 * float(basis.abs().max())
+        for entries, panel in zip(basis.unbind(-1), column[: map.action_dim], strict=True):
+            panel.axhline(0, color="0.5", linewidth=0.7)
+            lines = panel.plot(entries, linewidth=1.4)
+            panel.set(ylim=(-reach, reach), xlim=(0, max(1, len(actuation) - 1)))
+        kind = "basis" if isinstance(map, nht.LinearActionMap) else "derivative by the action"
+        column[0].set_title(f"{name}: {kind}", fontsize=10)
+        column[-1].set_xlabel("step")
+    for motor, line in enumerate(lines):
+        line.set_label(f"motor {motor + 1}")
+    figure.legend(handles=lines, loc="outside lower center", ncols=7, frameon=False)
+    _save(figure, path)
+
+
+def tool_figure(
+    maps: Mapping[str, nht.ActionMap], demos: nht.Demos, arm: nht.JacobianPinv, axes: int, path: str | Path
+) -> None:
+    """Where each action axis moves the tool, seen from above: beside each other the maps, below each other the axes.
+
+    Dots are demonstrated positions of the tool, those nearest to a grid; an arrow from each is the tool's velocity
+    for an action on that axis, drawn to one scale for all axes of a map. The colour is the vertical share of the
+    motion, so that a dot without an arrow moves straight up or down, or not at all.
+
+    Args:
+        maps: trained maps, by the name to show.
+        demos: demonstrations that have "joint_angle" (T, n) and "tool_position" (T, 3), and the maps' context keys.
+        arm: what moves the tool.
+        axes: how many of the action axes to show.
+        path: of the PNG file.
+
+    Raises:
+        ValueError: if a map is not trained.
+    """
+    position = demos.data["tool_position"]
+    rows = near_grid(position[:, :2])
+    position = position[rows]
+    jacobian = arm.jacobian(demos.data["joint_angle"][rows])[:, :3]
+    figure, panels = _panels(axes, len(maps), width=2.1, height=2.6, sharex=True, sharey=True)
+    for (name, map), column in zip(maps.items(), panels.T, strict=True):
+        velocity = (jacobian @ axis_motion(map, demos.context(_keys(map))[rows]))[..., :axes]
+        longest = float(velocity[:, :2].norm(dim=1).max())
+        for moved, panel in zip(velocity.unbind(-1), column[: map.action_dim], strict=True):
+            _quiver(panel, position, moved, longest)
+        shown = "" if map.action_dim == axes else f" ({min(axes, map.action_dim)} of {map.action_dim} axes)"
+        column[0].set_title(name + shown, fontsize=10)
+        column[-1].set_xlabel("x [m]")
+    bar = figure.colorbar(
+        ScalarMappable(STEEP, SLOPES), ax=figure.axes, location="bottom", shrink=0.3, aspect=30, extend="both"
+    )
+    bar.set_ticks([-0.1, 0, 0.1], labels=["10 % down", "level", "10 % up"])
+    _save(figure, path)
+
+
+@torch.no_grad()
+def local_basis(map: nht.ActionMap, context: Tensor, actuation: Tensor) -> Tensor:
+    """Q(c); of a map that is not linear, the derivative of the actuation at the projected demonstrated action.
+
+    Args:
+        map: any map.
+        context: (T, context_dim).
+        actuation: demonstrated there, (T, n).
+
+    Returns:
+        (T, n, k).
+    """
+    if isinstance(map, nht.LinearActionMap):
+        return map.basis(context)
+    return vmap(jacfwd(map))(map.project(actuation, context), context)
+
+
+@torch.no_grad()
+def axis_motion(map: nht.ActionMap, context: Tensor) -> Tensor:
+    """The actuation that an action of `action_scale` on each axis adds to that of no action.
+
+    Args:
+        map: any map.
+        context: (T, context_dim).
+
+    Returns:
+        (T, n, k).
+    """
+    actions = map.action_scale * torch.eye(map.action_dim)
+    still = map(torch.zeros(len(context), map.action_dim), context)
+    return torch.stack([map(action.expand(len(context), -1), context) - still for action in actions], dim=-1)
+
+
+def near_grid(points: Tensor) -> Tensor:
+    """Of points (T, 2), the rows of those that are nearest to the nodes of a grid over them, where any are near."""
+    low, high = points.amin(0), points.amax(0)
+    step = (high - low).max().clamp_min(1e-9) / GRID
+    counts = ((high - low) / step).round().int().clamp_min(1).tolist()
+    nodes = low + step * (0.5 + torch.cartesian_prod(*(torch.arange(count) for count in counts)))
+    nearest = torch.cdist(nodes, points).min(1)
+    return nearest.indices[nearest.values <= step / 2].unique()
+
+
+def _quiver(panel: Axes, position: Tensor, velocity: Tensor, longest: float) -> None:
+    """Dots at (T, 3) and arrows along (T, 3), the longest as long as the grid is wide."""
+    slope = velocity[:, 2] / velocity.norm(dim=1).clamp_min(1e-9)
+    spread = float((position.amax(0) - position.amin(0)).max()) / GRID
+    x, y = position[:, :2].mT
+    panel.scatter(x, y, c=slope, s=5, cmap=SLOPES, norm=STEEP)
+    panel.quiver(
+        *(x, y, *velocity[:, :2].mT, slope),
+        cmap=SLOPES,
+        norm=STEEP,
+        angles="xy",
+        scale_units="xy",
+        scale=max(longest, 1e-9) / spread,
+        width=0.009,
+    )
+    panel.set_aspect("equal")
+    panel.margins(0.12)
+
+
+def _panels(
+    rows: int, columns: int, *, width: float, height: float, sharex: bool = False, sharey: bool = False
+) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure of ``(rows, columns)`` panels of a size [inch], a row for each action axis."""
+    size = (width * columns + 0.6, height * rows + 0.8)
+    figure, panels = plt.subplots(
+        rows, columns, figsize=size, layout="constrained", squeeze=False, sharex=sharex, sharey=sharey
+    )
+    for axis, panel in enumerate(panels[:, 0]):
+        panel.set_ylabel(f"axis {axis + 1}" + ("\ny [m]" if sharey else ""))
+    for panel in panels.flat:
+        panel.grid(alpha=0.25)
+        panel.set_axisbelow(True)
+    return figure, panels
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def _keys(map: nht.ActionMap) -> list[str]:
+    if map.context_keys is None:
+        raise ValueError(f"this {type(map).__name__} is not trained: it has no context keys")
+    return list(map.context_keys)
