@@ -3,6 +3,7 @@
 from importlib.metadata import version
 
 from nht.demos import Demos, load_demos, save_demos
+from nht.export import export_map
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
@@ -26,6 +27,7 @@ __all__ = [
     "MapTraining",
     "Residual",
     "certificate",
+    "export_map",
     "load_demos",
     "load_map",
     "projection_error",
