@@ -4,6 +4,7 @@ from importlib.metadata import version
 
 from nht.align import Aligned, align
 from nht.demos import Demos, load_demos, save_demos
+from nht.export import export_map
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
@@ -29,6 +30,7 @@ __all__ = [
     "Residual",
     "align",
     "certificate",
+    "export_map",
     "load_demos",
     "load_map",
     "projection_error",

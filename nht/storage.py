@@ -10,6 +10,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,13 +38,21 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
         The path.
     """
     path = Path(path)
-    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": json.dumps(_description(map))}
+    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": json.dumps(describe(map))}
     tensors = {name: value.detach().cpu().contiguous() for name, value in map.state_dict().items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-        save_file(tensors, Path(scratch) / path.name, header)
-        os.replace(Path(scratch) / path.name, path)
+    with replacing(path) as scratch:
+        save_file(tensors, scratch, header)
     return path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A scratch file of the same name, which takes the place of `path` once it is written whole."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        scratch = Path(folder) / path.name
+        yield scratch
+        os.replace(scratch, path)
 
 
 def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
@@ -77,7 +86,8 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
     return map.to(device).eval().requires_grad_(False)
 
 
-def _description(map: ActionMap) -> dict[str, Any]:
+def describe(map: ActionMap) -> dict[str, Any]:
+    """What whoever reads only the header learns of a map: JSON values, None where a number is infinite."""
     return {
         "class": type(map).__name__,
         "init_args": _encoded(map),

@@ -207,3 +207,13 @@ class Report:
     runs: list[str] = field(default_factory=list)  # folders of runs, or folders that hold them
     out: str = ""
     title: str = ""
+
+
+@dataclass
+class ExportMap:
+    """``python -m nht.recipes.export_map``."""
+
+    file: str = ""  # a saved map
+    out: str = ""  # name.onnx or name.pt2; replaced if it exists
+    action_scale: float | None = 1.0  # as the policy was trained with, see MapConfig
+    compiled: bool = False  # .pt2 only: machine code, for C++

@@ -38,7 +38,8 @@ LAYERS = {
     "nht.lipschitz": 3,
     "nht.storage": 4,
     "nht.train": 4,
-    "nht": 5,
+    "nht.export": 5,
+    "nht": 6,
 }
 FAMILY_LAYER = 2
 

@@ -1,0 +1,22 @@
+"""A saved map for the robot, as a program that needs no nht.
+
+python -m nht.recipes.export_map file=runs/nht.safetensors out=runs/nht.onnx
+"""
+
+from __future__ import annotations
+
+import nht
+from nht.recipes.config import ExportMap
+from nht.recipes.launch import launch
+
+
+def main(config: ExportMap) -> None:
+    """Export, and say what to feed it."""
+    map = nht.load_map(config.file)
+    out = nht.export_map(map, config.out, action_scale=config.action_scale, compiled=config.compiled)
+    keys = "" if map.context_keys is None else f": {list(map.context_keys)}, side by side"
+    print(f"{out}: action (batch, {map.action_dim}), context (batch, {map.context_dim}){keys}")
+
+
+if __name__ == "__main__":
+    launch(main, ExportMap, "export_map")
