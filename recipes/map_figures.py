@@ -52,15 +52,14 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
         basis = local_basis(map, demos.context(_keys(map))[rows], actuation)
         reach = 1.1 * float(basis.abs().max())
         for entries, panel in zip(basis.unbind(-1), column[: map.action_dim], strict=True):
-            panel.axhline(0, color="0.5", linewidth=0.7)
-            lines = panel.plot(entries, linewidth=1.4)
+            panel.plot(entries, linewidth=1.4)
+            panel.axhline(0, color="0.5", linewidth=0.7, zorder=1)
             panel.set(ylim=(-reach, reach), xlim=(0, max(1, len(actuation) - 1)))
         kind = "basis" if isinstance(map, nht.LinearActionMap) else "derivative by the action"
         column[0].set_title(f"{name}: {kind}", fontsize=10)
         column[-1].set_xlabel("step")
-    for motor, line in enumerate(lines):
-        line.set_label(f"motor {motor + 1}")
-    figure.legend(handles=lines, loc="outside lower center", ncols=7, frameon=False)
+    motors = [f"motor {motor + 1}" for motor in range(actuation.shape[-1])]
+    figure.legend(panels[0, 0].lines[:-1], motors, loc="outside lower center", ncols=7, frameon=False)
     _save(figure, path)
 
 
@@ -141,7 +140,8 @@ def near_grid(points: Tensor) -> Tensor:
     low, high = points.amin(0), points.amax(0)
     step = (high - low).max().clamp_min(1e-9) / GRID
     counts = ((high - low) / step).round().int().clamp_min(1).tolist()
-    nodes = low + step * (0.5 + torch.cartesian_prod(*(torch.arange(count) for count in counts)))
+    sides = (torch.arange(count) - (count - 1) / 2 for count in counts)
+    nodes = (low + high) / 2 + step * torch.cartesian_prod(*sides)
     nearest = torch.cdist(nodes, points).min(1)
     return nearest.indices[nearest.values <= step / 2].unique()
 
