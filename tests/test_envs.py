@@ -22,6 +22,14 @@ CONSTANT = {"wam_wipe": {("observation", 12), ("goal", 2)}}  # the goal's height
 
 # Copy 0 of two, seed 0, after three steps of `random_actions`: what the policy sees, and the three rewards.
 GOLDEN = {
+    "wam_grasp": (
+        [
+            *(0.0873, 0.56046, 0.02466, 2.22661, 0.10689, 0.14755, 0.11569),  # joint angles
+            *(0.51065, 0.0583, 0.00022),  # tool
+            *(0.47222, -0.02048, -0.08141),  # grasp point
+        ],
+        [-1.0, -1.0, -1.0],
+    ),
     "wam_wipe": (
         [
             *(-0.15767, 0.40263, 0.0544, 2.13132, -0.05915, 0.57357, -0.1523),  # joint angles
@@ -30,7 +38,7 @@ GOLDEN = {
             *(0.03401, -0.01453, -0.99932),  # face normal
         ],
         [-1.0, -1.0, -1.0],
-    )
+    ),
 }
 
 
