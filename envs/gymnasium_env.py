@@ -85,7 +85,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.task.close()
 
 
-GYMNASIUM_IDS = {"wam_wipe": "nht/WAMWipe-v0"}
+GYMNASIUM_IDS = {"wam_grasp": "nht/WAMGrasp-v0", "wam_wipe": "nht/WAMWipe-v0"}
 """Gymnasium's id of every task."""
 
 
