@@ -91,6 +91,7 @@ GYMNASIUM_IDS = {
     "half_cheetah": "nht/HalfCheetah-v0",
     "hopper": "nht/Hopper-v0",
     "walker2d": "nht/Walker2d-v0",
+    "wam_grasp": "nht/WAMGrasp-v0",
     "wam_wipe": "nht/WAMWipe-v0",
 }
 """Gymnasium's id of every task."""

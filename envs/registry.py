@@ -8,22 +8,24 @@ from typing import Any
 import torch
 
 from nht.envs.ant import Ant
-from nht.envs.experts import Expert, WipeExpert
+from nht.envs.experts import Expert, GraspExpert, WipeExpert
 from nht.envs.locomotion import HalfCheetah, Hopper, Walker2d
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.task import BatchedTask
 from nht.envs.wam import WAMWipe
+from nht.envs.wam_grasp import WAMGrasp
 
 TASKS: dict[str, type[BatchedTask]] = {
     "ant": Ant,
     "half_cheetah": HalfCheetah,
     "hopper": Hopper,
     "walker2d": Walker2d,
+    "wam_grasp": WAMGrasp,
     "wam_wipe": WAMWipe,
 }
 """Every task by the name that recipes and ``make_env`` use."""
 
-EXPERTS: dict[str, type[Expert]] = {"wam_wipe": WipeExpert}
+EXPERTS: dict[str, type[Expert]] = {"wam_grasp": GraspExpert, "wam_wipe": WipeExpert}
 """The scripted demonstrator of every task that has one."""
 
 

@@ -31,7 +31,7 @@ KINDS: dict[str, type[nht.ActionMap]] = {
 }
 """Every kind of map by the name that configurations use."""
 
-ARMS = {"wam_wipe": wam_kinematics}
+ARMS = {"wam_grasp": wam_kinematics, "wam_wipe": wam_kinematics}
 """The kinematics of every task that is done by an arm with known ones."""
 
 

@@ -1,5 +1,7 @@
 """Gymnasium's side of every task, and pictures of it."""
 
+import math
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from fresh_process import run
 from nht.envs import GYMNASIUM_IDS, make_env
 from nht.envs.wam import GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT
+from nht.envs.wam_grasp import HOME, grasp_point, grasp_posture
 from nht.envs.wam_kinematics import tool_pose
 
 
@@ -164,6 +167,30 @@ def test_the_goal_is_seen_wherever_it_lies_in_the_colour_of_its_state():
     assert all(seen[x, GOAL_HIGH[1]][1] > seen[x, GOAL_LOW[1]][1] + 100 for x in (GOAL_LOW[0], GOAL_HIGH[0]))
 
     task.goal[0] = tool_pose(START_POSTURE[None])[0][0] + np.array([0.028, 0, 0])
+    assert marked(env.render(), green)[1] > 20
+    task.failed[0] = True
+    assert marked(env.render(), red)[1] > 20
+    env.close()
+
+
+@pytest.mark.usefixtures("can_render")
+def test_the_grasp_point_is_seen_wherever_it_lies_in_the_colour_of_its_state():
+    env = gymnasium.make("nht/WAMGrasp-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    task, orange, green, red = env.unwrapped.task, (0.95, 0.6, 0.1), (0.2, 0.7, 0.25), (0.85, 0.15, 0.15)
+    polar, azimuth = np.array([0.0, 0.9, 0.9]), np.array([0.0, math.pi / 2, -math.pi / 2])
+    seen = []
+    for goal in grasp_point(polar, azimuth):
+        task.goal[0] = goal
+        centre, size = marked(env.render(), orange)
+        assert size > 100
+        seen.append(centre)
+    # The camera looks back at the arm: y goes to the right.
+    assert seen[0][0] < min(seen[1][0], seen[2][0])
+    assert seen[2][1] + 30 < seen[0][1] < seen[1][1] - 30
+
+    task.qpos[0] = grasp_posture(task.goal, HOME[None])[0]
+    env.step(np.zeros(7))
     assert marked(env.render(), green)[1] > 20
     task.failed[0] = True
     assert marked(env.render(), red)[1] > 20

@@ -240,7 +240,9 @@ def test_a_jacobian_without_an_arm():
     config = configure(TrainMap, "train_map", ["map=jacobian", "out=unused"])
     assert config.env.context_keys == ["joint_angle"]
     cheetah = replace(config.env, name="half_cheetah")
-    with pytest.raises(ValueError, match=r"kinematics: \['wam_wipe'\] have one, 'half_cheetah' does not"):
+    with pytest.raises(
+        ValueError, match=r"kinematics: \['wam_grasp', 'wam_wipe'\] have one, 'half_cheetah' does not"
+    ):
         train_map.make_map(config.map, 17, 6, 0, cheetah)
     wide = replace(config.env, context_keys=["tool_position", "joint_angle"])
     with pytest.raises(ValueError, match=r"needs env.context_keys=\[joint_angle\].*'tool_position'"):

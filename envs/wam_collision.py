@@ -1,0 +1,118 @@
+"""Exact distances from the moving geoms of an arm to what stands around it, for many postures at once."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from nht.envs.task import Array
+
+SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE.value
+CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE.value
+CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER.value
+
+
+class ArmGeoms:
+    """The spheres, capsules and cylinders that a serial arm of hinges moves, placed for N postures together.
+
+    A geom is a centre, an axis, half a length and a radius; a sphere is a capsule of no length. All are kept as they
+    lie at joint angles 0, and a posture turns them about the joint axes as those lie at joint angles 0, the last
+    joint first (the product of exponentials). What no joint moves is left out.
+
+    Args:
+        model: every joint is a hinge, in a body below that of the joint before.
+
+    Raises:
+        ValueError: if the joints are others, or a moving geom is of another type.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        depth = _moving_joints(model)
+        moving = np.flatnonzero(depth[model.geom_bodyid])
+        # From the hand to the shoulder: what a joint moves are then always the first geoms.
+        geoms = moving[np.argsort(-depth[model.geom_bodyid[moving]], kind="stable")]
+        for geom in geoms:
+            if model.geom_type[geom] not in (SPHERE, CAPSULE, CYLINDER):
+                raise ValueError(
+                    f"the moving geom {model.geom(geom).name!r} must be a sphere, a capsule or a cylinder, "
+                    f"got {mujoco.mjtGeom(model.geom_type[geom]).name}."
+                )
+        self.names: list[str] = [model.geom(geom).name for geom in geoms]
+        """The geoms in the order of all distances."""
+        self._moved = [int((depth[model.geom_bodyid[geoms]] > joint).sum()) for joint in range(model.njnt)]
+
+        data = mujoco.MjData(model)
+        data.qpos[:] = 0.0
+        mujoco.mj_kinematics(model, data)
+        axes = data.geom_xmat[geoms, 2::3]
+        self._at_zero = np.stack([data.geom_xpos[geoms].T, axes.T], axis=-1)[..., None]  # (3, G, 2, 1)
+        self._planes = [_turned_plane(axis) for axis in data.xaxis]
+        # Centres turn about the hinge, directions about the origin: (joints, 3, 2, 1).
+        self._anchors = np.stack([data.xanchor, np.zeros((model.njnt, 3))], axis=-1)[..., None]
+
+        types = model.geom_type[geoms]
+        self._radius: Array = model.geom_size[geoms, :1].copy()
+        self._half: Array = np.where(types == SPHERE, 0.0, model.geom_size[geoms, 1])[:, None]
+        self._round: NDArray[np.bool_] = (types != CYLINDER)[:, None]
+
+    def place(self, joint_angle: Array) -> tuple[Array, Array]:
+        """Centres [m] and axes of the G geoms at the joint angles ``(N, joints)`` [rad], each ``(3, G, N)``."""
+        cos, sin = np.cos(joint_angle.T), np.sin(joint_angle.T)
+        placed = np.repeat(self._at_zero, len(joint_angle), axis=-1)
+        for joint in reversed(range(len(self._moved))):
+            moved, anchor = placed[:, : self._moved[joint]], self._anchors[joint]
+            i, j = self._planes[joint]
+            x, y = moved[i] - anchor[i], moved[j] - anchor[j]
+            moved[i] = cos[joint] * x - sin[joint] * y + anchor[i]
+            moved[j] = sin[joint] * x + cos[joint] * y + anchor[j]
+        return placed[:, :, 0], placed[:, :, 1]
+
+    def distance_to_sphere(self, placed: tuple[Array, Array], centre: Array, radius: float) -> Array:
+        """Signed distances ``(N, G)`` [m] to a ball, negative where a geom cuts into it.
+
+        Args:
+            placed: what ``place`` returned.
+            centre: of the ball [m], ``(3,)``.
+            radius: of the ball [m].
+        """
+        middle, axis = placed
+        to_ball = centre[:, None, None] - middle
+        along = np.abs((to_ball * axis).sum(axis=0))
+        beside = np.sqrt(np.maximum((to_ball * to_ball).sum(axis=0) - along * along, 0.0))
+        beyond = along - self._half  # the end of the axis or the cap
+        rounded = np.hypot(beside, np.maximum(beyond, 0.0)) - self._radius
+        beside -= self._radius
+        flat = np.hypot(np.maximum(beside, 0.0), np.maximum(beyond, 0.0))
+        flat += np.minimum(np.maximum(beside, beyond), 0.0)
+        return np.where(self._round, rounded, flat).T - radius
+
+    def distance_to_floor(self, placed: tuple[Array, Array], height: float) -> Array:
+        """Signed distances ``(N, G)`` [m] to everything below a height [m], negative where a geom dips into it."""
+        middle, axis = placed
+        upright = np.abs(axis[2])
+        rim = np.where(self._round, 1.0, np.sqrt(np.maximum(1.0 - upright * upright, 0.0)))
+        return (middle[2] - height - self._half * upright - self._radius * rim).T
+
+
+def _turned_plane(axis: Array) -> tuple[int, int]:
+    """The coordinates (i, j) that a positive turn about a coordinate axis mixes: i goes towards j."""
+    along = int(np.argmax(np.abs(axis)))
+    if abs(abs(axis[along]) - 1.0) > 1e-9:
+        raise ValueError(f"the arm's hinges must lie along x, y or z at joint angles 0, got {axis}.")
+    plane = (along + 1) % 3, (along + 2) % 3
+    return plane if axis[along] > 0 else plane[::-1]
+
+
+def _moving_joints(model: mujoco.MjModel) -> NDArray[np.intp]:
+    """How many joints move each body: 0 for the world, and the number of the deepest joint plus one for others."""
+    if (model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE.value).any():
+        raise ValueError("the arm's joints must all be hinges.")
+    depth = np.zeros(model.nbody, dtype=np.intp)
+    for body in range(1, model.nbody):
+        first, count = model.body_jntadr[body], model.body_jntnum[body]
+        above = depth[model.body_parentid[body]]
+        if count and first != above:
+            raise ValueError(f"the arm must be one chain: body {model.body(body).name!r} starts a branch.")
+        depth[body] = above + count
+    return depth
