@@ -18,8 +18,8 @@ import torch
 
 import nht
 from nht.envs import make_expert, make_task
-from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
+from nht.recipes.recording import record_expert
 from nht.recipes.train_map import make_map
 
 SWIVELS = (0.0, 0.5, 1.0)  # [rad]
@@ -45,7 +45,7 @@ def compare(swivel: float) -> list[dict[str, float | str]]:
     """A row per map and height tolerance, for one swivel range."""
     env = EnvConfig(context_keys=CONTEXT, options={"start": "random", "swivel_range": swivel})
     with tempfile.TemporaryDirectory() as scratch:
-        demos = collect_demos(env, DemosConfig(), seed=0, path=Path(scratch) / "demos")
+        demos = record_expert(env, DemosConfig(), seed=0, path=Path(scratch) / "demos")
         width = demos.context(CONTEXT).shape[-1]
         rows = []
         for kind in ("svd", "nht"):

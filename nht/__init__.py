@@ -5,10 +5,12 @@ from importlib.metadata import version
 from nht.align import Aligned, align
 from nht.demos import Demos, load_demos, save_demos
 from nht.export import export_map
+from nht.hdf5 import from_hdf5
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.lipschitz import certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
+from nht.minari import from_minari, to_minari
 from nht.residual import Residual
 from nht.scl import SCL
 from nht.storage import load_map, save_map
@@ -31,11 +33,14 @@ __all__ = [
     "align",
     "certificate",
     "export_map",
+    "from_hdf5",
+    "from_minari",
     "load_demos",
     "load_map",
     "projection_error",
     "save_demos",
     "save_map",
+    "to_minari",
     "train_map",
 ]
 

@@ -20,13 +20,15 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, LazyMemmapStorage, ReplayBuffer
 
+from nht.episodes import check, items, key_name, listed, whole_episodes
+
 FORMAT = "nht.demos"
 FORMAT_VERSION = 1
 PACKAGES = ("nht", "torch", "torchrl", "tensordict", "numpy", "mujoco")  # whose versions the manifest records
 
 
 class Demos:
-    """Demonstrations, not to be changed. Made by `save_demos`, `load_demos` or `Demos.from_tensors`.
+    """Demonstrations, not to be changed: made by `save_demos`, `load_demos` or one of the methods `from_...`.
 
     Attributes:
         buffer: replay buffer over all transitions, `buffer.sample(256)`; nothing can be added to it.
@@ -65,8 +67,63 @@ class Demos:
             given = isinstance(next_context, Mapping)
             entries["next"] = dict(next_context) if given else {"context": next_context}
         entries |= {"actuation": actuation, "episode": episode.long()}
-        data = TensorDict(entries, batch_size=actuation.shape[:1])
-        manifest = _manifest(data, env=env, seed=None, expert="unknown", settings={})
+        return cls.from_episodes(TensorDict(entries, batch_size=actuation.shape[:1]), env=env)
+
+    @classmethod
+    def from_tensordict(
+        cls,
+        data: TensorDictBase,
+        *,
+        actuation_key: NestedKey = "action",
+        context: Mapping[str, NestedKey] | Sequence[NestedKey] = ("observation",),
+        episode_key: NestedKey | None = None,
+        done_key: NestedKey | None = None,
+        env: str = "unknown",
+    ) -> "Demos":
+        """Demonstrations from what TorchRL rolled out, collected or stored: `dataset[:]` of any of its data sets.
+
+        Where episodes end is found from ids of trajectories and flags; episodes that do not end are left out, and
+        their number is in the manifest under "settings".
+
+        Args:
+            data: (T,), or (N, T) with a trajectory in each row; in order of time, outcomes under "next".
+            actuation_key: (*batch, n), what the motors got.
+            context: keys that may serve as context, or such keys by the names they get: `{"goal": ("info",
+                "goal")}`; those that also stand under "next" are taken along.
+            episode_key: integers that differ between episodes, where they are not "episode" or those of a
+                collector.
+            done_key: true at an episode's last step, where it is not "done", "terminated" or "truncated".
+            env: a name for where they come from.
+
+        Raises:
+            KeyError: on a key that is not in the data; the message lists those that are.
+            ValueError: if nothing says where episodes end, or on values that are not finite.
+        """
+        episodes, left_out = whole_episodes(
+            data,
+            actuation_key=actuation_key,
+            context=context,
+            episode_key=episode_key,
+            done_key=done_key,
+        )
+        return cls.from_episodes(episodes, env=env, settings={"left_out_episodes": left_out})
+
+    @classmethod
+    def from_episodes(
+        cls,
+        data: TensorDictBase,
+        *,
+        env: str = "unknown",
+        expert: str = "unknown",
+        settings: Mapping[str, Any] | None = None,
+    ) -> "Demos":
+        """Demonstrations from a TensorDict as `save_demos` takes it, in temporary memory-mapped files.
+
+        Raises:
+            KeyError: if "actuation" or "episode" is missing.
+            ValueError: on data that are no whole, finite demonstrations.
+        """
+        manifest = _manifest(data, env=env, seed=None, expert=expert, settings=dict(settings or {}))
         return cls(_buffer(data, None), manifest)
 
     @property
@@ -103,9 +160,7 @@ class Demos:
         for key in keys:
             value = data.get(key, None)
             if not isinstance(value, Tensor):
-                raise KeyError(
-                    f"context key {key!r} is not in the demonstrations, which have {_listed(data)}"
-                )
+                raise KeyError(f"context key {key!r} is not in the demonstrations, which have {listed(data)}")
             if value.ndim != 2 or not value.is_floating_point():
                 raise ValueError(
                     f"context key {key!r} must hold floats (T, width), got {value.dtype} {tuple(value.shape)}"
@@ -118,7 +173,7 @@ def save_demos(
     path: str | Path,
     *,
     env: str,
-    seed: int,
+    seed: int | None,
     expert: str,
     settings: Mapping[str, Any] | None = None,
 ) -> Demos:
@@ -130,7 +185,7 @@ def save_demos(
             there is "done" (T, 1), the last transition of every episode must have it set.
         path: a folder that does not exist yet.
         env: name of the env.
-        seed: what the collection was seeded with.
+        seed: what the collection was seeded with, if it was.
         expert: name of the demonstrator.
         settings: options of env and expert, JSON values.
 
@@ -206,7 +261,7 @@ def _buffer(data: TensorDictBase, folder: Path | None) -> ReplayBuffer:
 def _manifest(
     data: TensorDictBase, *, env: str, seed: int | None, expert: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    _check(data)
+    check(data)
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -217,90 +272,20 @@ def _manifest(
         "episodes": len(torch.unique(data["episode"])),
         "transitions": len(data),
         "keys": {
-            _name(key): {"shape": list(value.shape[1:]), "dtype": str(value.dtype)}
-            for key, value in _items(data)
+            key_name(key): {"shape": list(value.shape[1:]), "dtype": str(value.dtype)}
+            for key, value in items(data)
         },
         "versions": _versions(),
         "fingerprint": _fingerprint(data),
     }
 
 
-def _check(data: TensorDictBase) -> None:
-    """Raises unless `data` are whole episodes of finite numbers with an actuation."""
-    for key in ("actuation", "episode"):
-        if key not in data:
-            raise KeyError(f"demonstrations need the key {key!r}, these have {_listed(data)}")
-    if data.batch_dims != 1 or len(data) == 0:
-        raise ValueError(f"demonstrations need a batch size (T,) with T >= 1, got {tuple(data.batch_size)}")
-    actuation, episode = data["actuation"], data["episode"]
-    if (
-        actuation.ndim != 2
-        or episode.ndim != 1
-        or not actuation.is_floating_point()
-        or episode.is_floating_point()
-    ):
-        raise ValueError(
-            "actuation must be floats (T, n) and episode integers (T,), got "
-            f"{actuation.dtype} {tuple(actuation.shape)} and {episode.dtype} {tuple(episode.shape)}"
-        )
-    for key, value in _items(data):
-        if not isinstance(value, Tensor):
-            raise ValueError(
-                f"demonstrations hold tensors only, but key {key!r} holds a {type(value).__name__}"
-            )
-        bad = int((~value.isfinite()).sum())
-        if bad:
-            raise ValueError(
-                f"demonstrations must be finite, but key {key!r} holds {bad} NaN or infinite values"
-            )
-    _check_episodes(data)
-
-
-def _check_episodes(data: TensorDictBase) -> None:
-    episode = data["episode"]
-    last = torch.cat([episode[1:] != episode[:-1], torch.ones_like(episode[:1], dtype=torch.bool)])
-    names, runs = torch.unique(episode[last], return_counts=True)
-    if (runs > 1).any():
-        raise ValueError(
-            f"the rows of an episode must stand together, but those of {int((runs > 1).sum())} do not, "
-            f"the first being episode {int(names[runs > 1][0])}"
-        )
-    if "done" not in data:
-        return
-    unfinished = episode[last & ~data["done"].reshape(len(data), -1).any(-1)]
-    if len(unfinished):
-        raise ValueError(
-            f"demonstrations must be whole episodes, but {len(unfinished)} of {len(names)} end without done, "
-            f"the first being episode {int(unfinished[0])}"
-        )
-
-
 def _fingerprint(data: TensorDictBase) -> str:
     digest = hashlib.sha256()
-    for key, value in _items(data):
-        digest.update(f"{_name(key)} {value.dtype} {tuple(value.shape)};".encode())
+    for key, value in items(data):
+        digest.update(f"{key_name(key)} {value.dtype} {tuple(value.shape)};".encode())
         digest.update(value.cpu().contiguous().flatten().view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _items(data: TensorDictBase) -> list[tuple[NestedKey, Tensor]]:
-    """Every entry with its key, sorted by name."""
-    return sorted(
-        data.items(include_nested=True, leaves_only=True, is_leaf=_is_leaf), key=lambda item: _name(item[0])
-    )
-
-
-def _is_leaf(kind: type) -> bool:
-    """Whether a type of entry is a leaf; TensorDict itself would hide those that are no tensors."""
-    return not issubclass(kind, TensorDictBase)
-
-
-def _name(key: NestedKey) -> str:
-    return key if isinstance(key, str) else "/".join(key)
-
-
-def _listed(data: TensorDictBase) -> str:
-    return ", ".join(repr(key) for key, _ in _items(data))
 
 
 def _versions() -> dict[str, str]:

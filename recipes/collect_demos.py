@@ -1,101 +1,147 @@
-"""Demonstrations from a task's scripted expert.
+"""Demonstrations from a task's scripted expert, a trained policy, or others' files.
 
 python -m nht.recipes.collect_demos env=wam_wipe demos.transitions=20000 out=runs/demos
+python -m nht.recipes.collect_demos source=policy source.path=runs/ddpg-wam_wipe-nht-seed0 out=runs/policy-demos
+python -m nht.recipes.collect_demos source=minari source.path=mujoco/halfcheetah/expert-v0 env.name=half_cheetah ...
 """
 
 from __future__ import annotations
 
+import re
+from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 
-import torch
-from tensordict import TensorDict, TensorDictBase
-from tqdm import tqdm
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import nht
-from nht.envs import BatchedMujocoEnv, Expert, make_env, make_expert
-from nht.recipes.config import CollectDemos, DemosConfig, EnvConfig
+from nht.envs import make_env
+from nht.envs.registry import TASKS
+from nht.recipes.config import DDPG, CollectDemos, DemosConfig, EnvConfig, SourceConfig
+from nht.recipes.demo_files import FILES, best_episodes, read_episodes
+from nht.recipes.environments import mapped_env
 from nht.recipes.launch import launch
-
-COPIES = 100
+from nht.recipes.networks import load_policy
+from nht.recipes.recording import COPIES, endings, has_success, record, record_expert
+from nht.recipes.run_folder import read_config
 
 
 def main(config: CollectDemos) -> None:
     """Collect, save and say what came out."""
-    demos = collect_demos(config.env, config.demos, config.seed, config.out)
+    if Path(config.out).exists():
+        raise FileExistsError(
+            f"{config.out} exists: demonstrations are never overwritten. Choose another folder."
+        )
+    demos = _collect(config)
     lengths = demos.episode.bincount()
     print(
-        f"{len(demos):,} transitions in {len(lengths):,} successful episodes of {float(lengths.float().mean()):.0f} "
-        f"steps on average\nsaved in {config.out}"
+        f"{len(demos):,} transitions in {len(lengths):,} episodes of {float(lengths.float().mean()):.0f} steps on "
+        f"average; {demos.manifest['settings']['left_out_episodes']:,} episodes left out\nsaved in {config.out}"
     )
 
 
-def collect_demos(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path) -> nht.Demos:
-    """Run the expert until ``demos.transitions`` transitions of successful episodes are there, and save them.
+def _collect(config: CollectDemos) -> nht.Demos:
+    source = config.source
+    if source.kind == "expert":
+        return record_expert(config.env, config.demos, config.seed, config.out)
+    if source.kind == "policy":
+        return record_policy(source.path, config.env, config.demos, config.seed, config.out)
+    if source.kind in FILES:
+        return import_demos(source, config.env, config.demos.min_return, config.out)
+    raise ValueError(f"unknown source.kind {source.kind!r}: choose from {['expert', 'policy', *FILES]}.")
 
-    Episodes end at success. Those that fail or run out of time are left out, and counted in the manifest.
+
+def record_policy(
+    run: str | None, env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path
+) -> nht.Demos:
+    """Demonstrations of a finished run's policy, without exploration: what the motors got, through the run's map.
+
+    The task's options are those of the run, but its episodes end at success and failure. Of tasks that know success,
+    successful episodes are kept; of all, those with a return of at least ``demos.min_return``.
 
     Raises:
-        FileExistsError: if ``path`` exists.
-        ValueError: if the task has no expert, or its options are unknown.
+        FileNotFoundError: if ``run`` holds no finished run.
+        ValueError: if it is of another task than ``env``.
     """
-    if Path(path).exists():
-        raise FileExistsError(f"{path} exists: demonstrations are never overwritten. Choose another folder.")
-    ending = {
-        "terminate_on_success": True,
-        "terminate_on_failure": True,
-        "max_episode_steps": demos.max_episode_steps,
+    if run is None:
+        raise ValueError("source=policy needs source.path: the folder of a finished run.")
+    folder = Path(run)
+    trained = read_config(folder, DDPG)
+    if trained.env.name != env.name:
+        raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
+    options = trained.env.options | endings(env.name)
+    task_config = replace(trained.env, options=options, num_threads=env.num_threads)
+    map = nht.load_map(folder / "map.safetensors")
+    simulation = mapped_env(task_config, map, trained.map.action_scale, seed=seed, num_envs=COPIES)
+    policy = load_policy(folder, simulation, trained.algo)
+    with closing(simulation), set_exploration_type(ExplorationType.DETERMINISTIC):
+        data, left_out = record(
+            simulation,
+            simulation.base_env.task,
+            policy,
+            demos,
+            judged=has_success(env.name),
+            actuation_key=("next", "actuation"),
+        )
+    settings = {
+        "options": options,
+        "run": str(run),
+        "min_return": demos.min_return,
+        "left_out_episodes": left_out,
     }
-    options = env.options | ending
-    simulation = make_env(env.name, COPIES, env.num_threads, seed=seed, **options)
-    settings = {} if demos.speed is None else {"speed": demos.speed}
-    expert = make_expert(env.name, **settings)
-    try:
-        data, unsuccessful = _record(simulation, expert, demos.transitions)
-    finally:
-        simulation.close()
-    manifest = {"options": options, "expert": settings, "left_out_episodes": unsuccessful}
-    name = type(expert).__name__
-    return nht.save_demos(data, path, env=env.name, seed=seed, expert=name, settings=manifest)
+    expert = f"{trained.map.kind} policy"
+    return nht.save_demos(data, path, env=env.name, seed=seed, expert=expert, settings=settings)
 
 
-def _record(simulation: BatchedMujocoEnv, expert: Expert, transitions: int) -> tuple[TensorDict, int]:
-    """Whole successful episodes, one after the other, and how many others were seen."""
-    current = simulation.reset()
-    steps: list[TensorDictBase] = []
-    length, collected = torch.zeros(COPIES, dtype=torch.int64), 0
-    patience = 10 * simulation.task.max_episode_steps
-    with tqdm(total=transitions, desc="demonstrations", unit="step", unit_scale=True) as progress:
-        while collected < transitions:
-            observation = {key: current[key].numpy() for key in simulation.task.observation_sizes}
-            current["action"] = torch.from_numpy(expert(observation)).float()
-            stepped, current = simulation.step_and_maybe_reset(current)
-            steps.append(stepped)
-            length += 1
-            done, success = (stepped["next", flag].view(-1) for flag in ("done", "success"))
-            collected += int(length[done & success].sum())
-            length[done] = 0
-            progress.update(min(collected, transitions) - progress.n)
-            if not collected and len(steps) >= patience:
-                raise RuntimeError(f"the expert had no success in {len(steps) * COPIES:,} steps.")
-    return _successful_episodes(torch.stack(steps, dim=1), list(simulation.task.observation_sizes))
+def import_demos(
+    source: SourceConfig, env: EnvConfig, min_return: float | None, path: str | Path
+) -> nht.Demos:
+    """Save the whole episodes of others' file as demonstrations of ``env``, those with ``min_return`` if it is given.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        KeyError: for a key that the file lacks; the message lists those that are there.
+        ValueError: if the file cannot be read, its values are not finite, or it does not fit the task.
+    """
+    data, left_out, found, expert = read_episodes(source)
+    expected = source.env or env.name
+    if found != "unknown" and _bare(found) != _bare(expected):
+        raise ValueError(
+            f"{source.path} holds demonstrations of env {found!r}, expected {expected!r}: set env or env.name, or "
+            "source.env if the task has another name there."
+        )
+    if min_return is not None:
+        data, worse = best_episodes(data, min_return)
+        left_out += worse
+    settings = {"source": asdict(source), "min_return": min_return, "left_out_episodes": left_out}
+    demos = nht.Demos.from_episodes(data, env=env.name, expert=expert, settings=settings)
+    check_fits(demos, env, source.path or "")
+    return nht.save_demos(demos.data, path, env=env.name, seed=None, expert=expert, settings=settings)
 
 
-def _successful_episodes(steps: TensorDictBase, keys: list[str]) -> tuple[TensorDict, int]:
-    """From ``(N, T)`` steps, the transitions of the episodes that ended in success, and the number that did not."""
-    done, success = (steps["next", flag].squeeze(-1) for flag in ("done", "success"))
-    nth = done.cumsum(dim=1) - done.long()  # of the copy's episodes
-    episode = nth + nth.amax() * torch.arange(len(nth))[:, None] + torch.arange(len(nth))[:, None]
-    kept = torch.isin(episode, episode[done & success])
-    flat, outcome = steps[kept], steps["next"][kept]
-    flags = ("reward", "success", "terminated", "truncated", "done")
-    data = {
-        **{key: flat[key] for key in keys},
-        "actuation": flat["action"],
-        "episode": episode[kept].unique_consecutive(return_inverse=True)[1],
-        **{flag: outcome[flag] for flag in flags},
-        "next": {key: outcome[key] for key in keys},
-    }
-    return TensorDict(data, batch_size=flat.batch_size), int((done & ~success).sum())
+def check_fits(demos: nht.Demos, env: EnvConfig, name: str) -> None:
+    """Check that demonstrations have the task's context keys, and as many motors and context entries as it has.
+
+    Raises:
+        KeyError: for a context key that they lack.
+        ValueError: for another width.
+    """
+    found = {key: demos.context([key]).shape[-1] for key in env.context_keys}
+    if env.name not in TASKS:
+        return
+    task = make_env(env.name, seed=0, **env.options)
+    task.close()
+    specs = {"actuation": task.action_spec, **task.observation_spec}
+    for key, width in {"actuation": demos.actuation.shape[-1], **found}.items():
+        if key in specs and width != specs[key].shape[-1]:
+            raise ValueError(
+                f"{name} does not fit {env.name}: {key!r} has {width} entries, the task's {specs[key].shape[-1]}."
+            )
+
+
+def _bare(env: str) -> str:
+    """A task's name without namespace, version and spelling: ``HalfCheetah-v5`` is ``half_cheetah``."""
+    return re.sub(r"[^a-z0-9]", "", re.sub(r"-v\d+$", "", env.rsplit("/", 1)[-1]).lower())
 
 
 if __name__ == "__main__":

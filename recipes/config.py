@@ -28,6 +28,20 @@ class DemosConfig:
     transitions: int = 20_000
     speed: float | None = None  # of the expert's tool [m/s]; None is its default
     max_episode_steps: int = 1_000  # a demonstration ends at success, long before
+    min_return: float | None = None  # of an episode worth keeping
+
+
+@dataclass
+class SourceConfig:
+    """What ``collect_demos`` makes demonstrations from. Keys may be nested: ``info/goal``."""
+
+    kind: str = "expert"  # expert, policy, minari, hdf5 or tensordict
+    path: str | None = None  # run folder; Minari id, folder or file; HDF5 file; TensorDict folder
+    env: str | None = None  # the task's name there, where it is not ours
+    context: dict[str, str] = field(default_factory=dict)  # their key by our name; none: observations
+    actuation_key: str | None = None  # hdf5, tensordict: None is "actions" and "action"
+    episode_key: str | None = None  # hdf5, tensordict: integers that differ between episodes
+    done_key: str | None = None  # hdf5, tensordict: true at an episode's last step; None takes the usual ones
 
 
 @dataclass
@@ -123,8 +137,18 @@ class CollectDemos:
 
     env: EnvConfig = field(default_factory=EnvConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
+    source: SourceConfig = field(default_factory=SourceConfig)
     seed: int = 0
     out: str = ""
+
+
+@dataclass
+class InspectDemos:
+    """``python -m nht.recipes.inspect_demos PATH``."""
+
+    demos: str = ""  # folder of demonstrations, or what source.path of collect_demos may be
+    directions: int = 10  # global directions whose energy is shown, at most
+    out: str | None = None  # of the figure; None puts it beside the demonstrations
 
 
 @dataclass

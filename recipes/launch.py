@@ -16,15 +16,18 @@ from omegaconf.errors import OmegaConfBaseException
 Config = TypeVar("Config")
 
 
-def launch(main: Callable[[Config], object], schema: type[Config], name: str) -> None:
+def launch(
+    main: Callable[[Config], object], schema: type[Config], name: str, positional: str | None = None
+) -> None:
     """Run ``main`` with the configuration that the command line asks for; say in one line what is wrong with it.
 
     Args:
         main: the recipe.
         schema: dataclass that ``main`` takes.
         name: YAML file under ``configs/`` that holds the recipe's values.
+        positional: setting that a word without a key sets: ``PATH`` is short for ``positional=PATH``.
     """
-    arguments = sys.argv[1:]
+    arguments = sys.argv[1:] if positional is None else [_keyed(word, positional) for word in sys.argv[1:]]
     if {"-h", "--help"} & set(arguments):
         print(f"{(schema.__doc__ or '').strip()}\n\nValues, each of which `key=value` overrides:\n")
         print(OmegaConf.to_yaml(_compose(schema, name, [])))
@@ -34,6 +37,14 @@ def launch(main: Callable[[Config], object], schema: type[Config], name: str) ->
     except ValueError as error:
         sys.exit(f"error: {error}")
     main(config)
+
+
+def _keyed(word: str, positional: str) -> str:
+    """A word of the command line as a Hydra override; quoted, for a path may hold any character."""
+    if "=" in word or word.startswith("-"):
+        return word
+    escaped = word.replace("'", r"\'")
+    return f"{positional}='{escaped}'"
 
 
 def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) -> Config:
@@ -60,9 +71,20 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
 
 
 def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
-    ConfigStore.instance().store(name=f"{name}_schema", node=schema)
+    ConfigStore.instance().store(name=f"{name}_schema", node=_opened(OmegaConf.structured(schema)))
     with initialize_config_module("nht.configs", version_base="1.3"):
         return compose(name, overrides=list(overrides))
+
+
+def _opened(node: DictConfig) -> DictConfig:
+    """Lets the dictionaries in it take new keys, which their readers check; dataclasses stay as they are."""
+    for key in node:
+        value = None if OmegaConf.is_missing(node, key) else node[key]
+        if isinstance(value, DictConfig):
+            if OmegaConf.get_type(value) is dict:
+                OmegaConf.set_struct(value, False)
+            _opened(value)
+    return node
 
 
 def _existing(schema: type[Any], error: Exception) -> str:

@@ -16,9 +16,9 @@ from tqdm import tqdm
 import nht
 from nht.envs import wam_kinematics
 from nht.maps import Activation
-from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
 from nht.recipes.launch import launch
+from nht.recipes.recording import record_expert
 
 KINDS: dict[str, type[nht.ActionMap]] = {
     "nht": nht.NHT,
@@ -67,7 +67,7 @@ def train_map(
     """
     with TemporaryDirectory() as scratch:
         if demos.path is None:
-            data = collect_demos(env, demos, seed, Path(scratch) / "demos")
+            data = record_expert(env, demos, seed, Path(scratch) / "demos")
         else:
             data = nht.load_demos(demos.path, env=env.name)
         context_dim = data.context(env.context_keys).shape[-1]

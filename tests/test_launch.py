@@ -6,11 +6,12 @@ import sys
 
 import pytest
 
-from nht.recipes.config import DDPG, CollectDemos, CompareMaps, Evaluate, Report, TrainMap
-from nht.recipes.launch import configure
+from nht.recipes.config import DDPG, CollectDemos, CompareMaps, Evaluate, InspectDemos, Report, TrainMap
+from nht.recipes.launch import configure, launch
 
 SCHEMAS = {
     "collect_demos": CollectDemos,
+    "inspect_demos": InspectDemos,
     "train_map": TrainMap,
     "compare_maps": CompareMaps,
     "ddpg": DDPG,
@@ -51,6 +52,27 @@ def test_all_settings_of_the_papers_table_2_can_be_set():
     config = configure(DDPG, "ddpg", overrides)
     assert config.map.hidden == [64, 64, 64]
     assert config.algo.critic_learning_rate == 1e-2
+
+
+@pytest.mark.parametrize("path", ["runs/demos", "it's (mine), {really}: $1 @ 5%/a b", "-", "a=b"])
+def test_a_word_without_a_key_sets_the_positional_setting(path, monkeypatch):
+    word = path if path[0] != "-" and "=" not in path else f"demos='{path}'"
+    monkeypatch.setattr(sys, "argv", ["inspect_demos", word, "directions=3"])
+    told = []
+    launch(told.append, InspectDemos, "inspect_demos", positional="demos")
+    assert told == [InspectDemos(demos=path, directions=3)]
+
+
+def test_dictionaries_take_new_keys_and_nothing_else_does():
+    config = configure(
+        CollectDemos, "collect_demos", ["source.context={joint: info/joint}", "env.options.new=1"]
+    )
+    assert config.source.context == {"joint": "info/joint"}
+    assert config.env.options["new"] == 1
+    assert config.env.options["start"] == "fixed"
+    assert CollectDemos().source.context == {}
+    with pytest.raises(ValueError, match=r"Could not override 'source.contxt'.*Keys here: \['kind', 'path'"):
+        configure(CollectDemos, "collect_demos", ["source.contxt={joint: info/joint}"])
 
 
 @pytest.mark.parametrize(

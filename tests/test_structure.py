@@ -25,7 +25,16 @@ OURS = {
 }
 # Others' packages, beside the standard library. Recipes may use any.
 THEIRS = {
-    "nht": {"minari", "numpy", "safetensors", "tensordict", "torch", "torchrl.data"},
+    "nht": {
+        "gymnasium.spaces",
+        "h5py",
+        "minari",
+        "numpy",
+        "safetensors",
+        "tensordict",
+        "torch",
+        "torchrl.data",
+    },
     "nht.transforms": {"tensordict", "torch", "torchrl"},
     "nht.envs": {"dm_control", "gymnasium", "mujoco", "numpy", "tensordict", "torch", "torchrl"},
     "nht.configs": set(),
@@ -33,7 +42,8 @@ THEIRS = {
 # Within nht, a module imports from lower layers only. Those not named here are members of the family of maps.
 LAYERS = {
     "nht.geometry": 0,
-    "nht.demos": 0,
+    "nht.episodes": 0,
+    "nht.demos": 1,
     "nht.maps": 1,
     "nht.lipschitz": 3,
     "nht.storage": 4,

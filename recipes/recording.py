@@ -1,0 +1,140 @@
+"""Whole episodes of a task, recorded as demonstrations: from its scripted expert, or from any controller."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+import nht
+from nht.envs import make_env, make_expert
+from nht.envs.registry import TASKS
+from nht.envs.task import BatchedTask
+from nht.recipes.config import DemosConfig, EnvConfig
+
+COPIES = 100
+FLAGS = ("reward", "success", "terminated", "truncated", "done")
+
+Controller = Callable[[TensorDictBase], TensorDictBase]
+"""Writes ``"action"`` into what the environment shows."""
+
+
+def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path) -> nht.Demos:
+    """Run the expert until ``demos.transitions`` transitions of good episodes are there, and save them.
+
+    Episodes end at success. Those that fail or run out of time are left out, and counted in the manifest.
+
+    Raises:
+        FileExistsError: if ``path`` exists.
+        ValueError: if the task has no expert, or its options are unknown.
+    """
+    if Path(path).exists():
+        raise FileExistsError(f"{path} exists: demonstrations are never overwritten. Choose another folder.")
+    settings = {} if demos.speed is None else {"speed": demos.speed}
+    expert = make_expert(env.name, **settings)
+    options = env.options | endings(env.name) | {"max_episode_steps": demos.max_episode_steps}
+    simulation = make_env(env.name, COPIES, env.num_threads, seed=seed, **options)
+
+    def act(current: TensorDictBase) -> TensorDictBase:
+        observation = {key: current[key].numpy() for key in simulation.task.observation_sizes}
+        return current.set("action", torch.from_numpy(expert(observation)).float())
+
+    with closing(simulation):
+        data, left_out = record(simulation, simulation.task, act, demos, judged=has_success(env.name))
+    manifest = {"options": options, "expert": settings, "left_out_episodes": left_out}
+    name = type(expert).__name__
+    return nht.save_demos(data, path, env=env.name, seed=seed, expert=name, settings=manifest)
+
+
+def endings(task: str) -> dict[str, bool]:
+    """The options that end a task's episodes at success and at failure, as far as it knows these."""
+    known = inspect.signature(TASKS[task]).parameters if task in TASKS else {}
+    return {name: True for name in ("terminate_on_success", "terminate_on_failure") if name in known}
+
+
+def has_success(task: str) -> bool:
+    """Whether a task has a notion of success: whether its episodes can end there."""
+    return "terminate_on_success" in endings(task)
+
+
+@torch.no_grad()
+def record(
+    simulation: EnvBase,
+    task: BatchedTask,
+    act: Controller,
+    demos: DemosConfig,
+    *,
+    judged: bool,
+    actuation_key: NestedKey = "action",
+) -> tuple[TensorDict, int]:
+    """Run ``act`` until ``demos.transitions`` transitions of good episodes are there.
+
+    Args:
+        simulation: copies of a task, transformed or not.
+        task: what it simulates.
+        act: chooses the actions.
+        demos: how many transitions, and the return that a good episode must have.
+        judged: whether a good episode must end in success.
+        actuation_key: what the motors got, in the record of a step.
+
+    Returns:
+        the good episodes, one after the other, and how many others ended.
+
+    Raises:
+        RuntimeError: if there is no good episode in ten times the longest duration of one.
+    """
+    least = -math.inf if demos.min_return is None else demos.min_return
+    current = simulation.reset()
+    steps: list[TensorDict] = []
+    length = torch.zeros(simulation.batch_size, dtype=torch.int64)
+    total, collected = torch.zeros(simulation.batch_size, dtype=torch.float64), 0
+    with tqdm(total=demos.transitions, desc="demonstrations", unit="step", unit_scale=True) as progress:
+        while collected < demos.transitions:
+            stepped, current = simulation.step_and_maybe_reset(act(current))
+            done, success = (stepped["next", flag].view(-1) for flag in ("done", "success"))
+            length += 1
+            total += stepped["next", "reward"].view(-1)
+            good = done & (total >= least) & (success | (not judged))
+            steps.append(_transition(stepped, list(task.observation_sizes), actuation_key, good))
+            collected += int(length[good].sum())
+            length[done], total[done] = 0, 0.0
+            progress.update(min(collected, demos.transitions) - progress.n)
+            if not collected and len(steps) >= 10 * task.max_episode_steps:
+                wanted = ["a success"] * judged + [f"a return of at least {least}"] * math.isfinite(least)
+                raise RuntimeError(
+                    f"no episode in {len(steps) * len(length):,} steps had {' and '.join(wanted) or 'an end'}."
+                )
+    return _good_episodes(torch.stack(steps, dim=1))
+
+
+def _transition(
+    stepped: TensorDictBase, keys: list[str], actuation_key: NestedKey, good: torch.Tensor
+) -> TensorDict:
+    """What is kept of a step, ``(N,)``, and whether it ended a good episode."""
+    outcome = stepped["next"]
+    entries = {
+        **{key: stepped[key] for key in keys},
+        "actuation": stepped[actuation_key],
+        **{flag: outcome[flag] for flag in FLAGS},
+        "next": {key: outcome[key] for key in keys},
+        "good": good,
+    }
+    return TensorDict(entries, batch_size=stepped.batch_size)
+
+
+def _good_episodes(steps: TensorDict) -> tuple[TensorDict, int]:
+    """From ``(N, T)`` steps, the transitions of the good episodes, and the number of others that ended."""
+    done, good = steps["done"].squeeze(-1), steps["good"]
+    nth = done.cumsum(dim=1) - done.long()  # of the copy's episodes
+    episode = nth + (nth.amax() + 1) * torch.arange(len(nth))[:, None]
+    kept = torch.isin(episode, episode[good])
+    data = steps[kept].exclude("good")
+    data["episode"] = episode[kept].unique_consecutive(return_inverse=True)[1]
+    return data, int((done & ~good).sum())
