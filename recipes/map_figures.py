@@ -95,8 +95,14 @@ def tool_figure(
         shown = "" if map.action_dim == axes else f" ({min(axes, map.action_dim)} of {map.action_dim} axes)"
         column[0].set_title(name + shown, fontsize=10)
         column[-1].set_xlabel("x [m]")
+    share = min(0.9, 4.5 / figure.get_figwidth())  # of the width
     bar = figure.colorbar(
-        ScalarMappable(STEEP, SLOPES), ax=figure.axes, location="bottom", shrink=0.3, aspect=30, extend="both"
+        ScalarMappable(STEEP, SLOPES),
+        ax=figure.axes,
+        location="bottom",
+        shrink=share,
+        aspect=30,
+        extend="both",
     )
     bar.set_ticks([-0.1, 0, 0.1], labels=["10 % down", "level", "10 % up"])
     _save(figure, path)
