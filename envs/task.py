@@ -126,6 +126,9 @@ class BatchedTask(ABC):
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
         """Reward, terminated, success and failure ``(N,)`` after ``actuation`` was carried out."""
 
+    def _note_diverged(self, diverged: Flags) -> None:
+        """Take note of the copies ``(N,)`` that diverged, before they are judged; by default nothing."""
+
     def _apply(self, actuation: Array) -> None:
         """Hand the actuation ``(N, n)`` to the simulation: by default as the control of all substeps."""
         self._control[:] = actuation[:, None, :]
@@ -162,6 +165,7 @@ class BatchedTask(ABC):
         applied[invalid] = 0.0
         diverged = invalid | self._advance(applied)
         self.steps += 1
+        self._note_diverged(diverged)
 
         reward, terminated, success, failure = self._judge(applied)
         return Outcome(

@@ -158,6 +158,9 @@ class WAMWipe(BatchedTask):
             "goal": self.goal.copy(),
         }
 
+    def _note_diverged(self, diverged: Flags) -> None:
+        self.failed |= diverged
+
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
         self._update_pose()
         off_table = np.abs(self._position[:, 2] - TABLE_HEIGHT) > self.height_tolerance

@@ -126,6 +126,9 @@ class WAMGrasp(BatchedTask):
             "goal": self.goal.copy(),
         }
 
+    def _note_diverged(self, diverged: Flags) -> None:
+        self.failed |= diverged
+
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
         self._update_pose()
         self.failed |= clearance(self._arm, self.qpos) < 0

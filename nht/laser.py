@@ -7,7 +7,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from nht.maps import ActionMap, Activation, ContextNetwork
+from nht.maps import ActionMap
+from nht.networks import Activation, ContextNetwork
 
 LOG_VARIANCE_RANGE = (-20.0, 20.0)  # of a latent, clamped: exp of what is far outside would overflow
 

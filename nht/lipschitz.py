@@ -14,7 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from nht.align import Aligned
-from nht.maps import ACTIVATION_SLOPES, ActionMap, ContextNetwork, LinearActionMap
+from nht.maps import ActionMap, LinearActionMap
+from nht.networks import ACTIVATION_SLOPES, ContextNetwork
 from nht.residual import Residual
 
 ROUNDING = 1e-6  # a limit is undercut by this share, lest rounding a scaled matrix to float32 exceed it

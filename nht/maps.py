@@ -3,7 +3,6 @@
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any, Literal, get_args
 
 import torch
@@ -17,12 +16,9 @@ from nht.geometry import (
     least_squares,
     sphere_exp,
 )
+from nht.networks import Activation, ContextNetwork, check_choice
 
-Activation = Literal["relu", "sigmoid", "tanh"]
 NormKind = Literal["spectral", "frobenius"]
-
-ACTIVATION_SLOPES = {"relu": 1.0, "sigmoid": 0.25, "tanh": 1.0}  # the largest slope of each
-FLATTEST = 0.1  # the normaliser takes no deviation for smaller than this share of the largest
 
 
 class ActionMap(nn.Module, ABC):
@@ -119,7 +115,7 @@ class LinearActionMap(ActionMap):
         lipschitz_norm: the norm of the layers' matrices that is limited to this end.
     """
 
-    network: "ContextNetwork | None"
+    network: ContextNetwork | None
 
     def __init__(
         self,
@@ -132,7 +128,7 @@ class LinearActionMap(ActionMap):
         super().__init__(context_dim, actuation_dim, action_dim)
         if lipschitz is not None and not 0 < lipschitz < torch.inf:
             raise ValueError(f"lipschitz must be a positive number or None, got {lipschitz}")
-        _check_choice("lipschitz_norm", lipschitz_norm, get_args(NormKind))
+        check_choice("lipschitz_norm", lipschitz_norm, get_args(NormKind))
         self.network = None
         self.network_gain = 0.0
         self.lipschitz = lipschitz
@@ -149,112 +145,6 @@ class LinearActionMap(ActionMap):
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
         """Least squares: the action whose actuation is nearest (Eq. 5)."""
         return least_squares(self.basis(context), actuation)
-
-
-class Heads(nn.Module):
-    """Linear layers side by side, each on its own share of the input: one layer with a block-diagonal matrix.
-
-    Args:
-        heads: number of layers.
-        input_dim: width of each one's input.
-        output_dim: width of each one's output.
-    """
-
-    def __init__(self, heads: int, input_dim: int, output_dim: int) -> None:
-        super().__init__()
-        layers = [nn.Linear(input_dim, output_dim) for _ in range(heads)]
-        self.weight = nn.Parameter(torch.stack([layer.weight.detach() for layer in layers]))
-        self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers]))
-
-    def forward(self, value: Tensor) -> Tensor:
-        """Maps (*batch, heads * input_dim) to (*batch, heads * output_dim)."""
-        shares = value.unflatten(-1, (len(self.weight), -1)).unsqueeze(-1)
-        return ((self.weight @ shares).squeeze(-1) + self.bias).flatten(-2)
-
-
-class ContextNetwork(nn.Module):
-    """A multilayer perceptron on the context, which it normalises first: (c - mean) / std.
-
-    It may have other inputs, which it takes as they are.
-
-    Args:
-        context_dim: width of the context.
-        output_dim: width of the output.
-        hidden: widths of the hidden layers; empty for a single linear layer.
-        activation: after each hidden layer.
-        seed: of the initial weights. The global random state is neither used nor changed.
-        other_dim: width of the other inputs.
-        heads: equal parts of the output, each of which gets a last hidden layer of its own.
-    """
-
-    context_mean: Tensor
-    context_std: Tensor
-
-    def __init__(
-        self,
-        context_dim: int,
-        output_dim: int,
-        hidden: Sequence[int],
-        activation: Activation,
-        seed: int,
-        *,
-        other_dim: int = 0,
-        heads: int = 1,
-    ) -> None:
-        super().__init__()
-        _check_choice("activation", activation, get_args(Activation))
-        if context_dim < 1 or any(width < 1 for width in hidden):
-            raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}")
-        if heads > 1 and not hidden:
-            raise ValueError(
-                "several heads need a hidden layer that they can have of their own, got hidden=[]"
-            )
-        self.activation = activation
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(seed)
-            widths = [context_dim + other_dim, *hidden]
-            widths[-1] *= heads if hidden else 1
-            self.layers = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
-            if heads > 1:
-                self.layers.append(Heads(heads, hidden[-1], output_dim // heads))
-            else:
-                self.layers.append(nn.Linear(widths[-1], output_dim))
-        self.register_buffer("context_mean", torch.zeros(context_dim))
-        self.register_buffer("context_std", torch.ones(context_dim))
-
-    def forward(self, context: Tensor, *others: Tensor) -> Tensor:
-        """Maps (*batch, context_dim), and others (*batch, width), to (*batch, output_dim)."""
-        value = (context - self.context_mean) / self.context_std
-        if others:
-            value = torch.cat([value, *others], dim=-1)
-        for layer in self.layers[:-1]:
-            value = getattr(torch, self.activation)(layer(value))
-        return self.layers[-1](value)
-
-    def linear(self, index: int) -> "nn.Linear | Heads":
-        """One of the layers, with its type."""
-        layer = self.layers[index]
-        assert isinstance(layer, nn.Linear | Heads)
-        return layer
-
-    @torch.no_grad()
-    def normalise(self, context: Tensor) -> None:
-        """Takes mean and deviation from contexts (T, context_dim).
-
-        Deviations much smaller than the largest are raised: what hardly moves in the demonstrations, a height
-        over a table for example, would become the loudest input as soon as it moves more.
-        """
-        std = context.std(0, correction=0)
-        floor = FLATTEST * std.max()
-        self.context_mean.copy_(context.mean(0))
-        self.context_std.copy_(std.clamp_min(floor) if floor > 0 else torch.ones_like(std))
-
-    @torch.no_grad()
-    def start_from_one_output(self, size: float, seed: int) -> None:
-        """Lets all contexts start from nearly the same output, normally distributed with deviation `size`."""
-        head = self.linear(-1)
-        head.weight.mul_(0.1)
-        head.bias.normal_(std=size, generator=torch.Generator().manual_seed(seed))
 
 
 class NHT(LinearActionMap):
@@ -399,8 +289,3 @@ class Identity(LinearActionMap):
     def fit(self, batch: TensorDictBase) -> bool:
         """There is nothing to learn."""
         return True
-
-
-def _check_choice(name: str, given: str, allowed: Sequence[str]) -> None:
-    if given not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {given!r}")

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from nht.maps import Activation, ContextNetwork, LinearActionMap, NormKind
+from nht.maps import LinearActionMap, NormKind
+from nht.networks import Activation, ContextNetwork
 
 
 class SCL(LinearActionMap):

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 import nht
 from nht.envs import wam_kinematics
-from nht.maps import Activation
+from nht.networks import Activation
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
 from nht.recipes.launch import launch
 from nht.recipes.recording import record_expert

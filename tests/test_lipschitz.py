@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 import nht
 from nht.lipschitz import LipschitzProjection, certificate
-from nht.maps import ActionMap, Activation, NormKind
+from nht.maps import ActionMap, NormKind
+from nht.networks import Activation
 
 ACTIVATIONS: list[Activation] = ["relu", "sigmoid", "tanh"]
 CONTEXT_DIM = 5

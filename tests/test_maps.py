@@ -13,7 +13,8 @@ from torch import Tensor
 
 import nht
 from nht.geometry import householder_frame
-from nht.maps import ActionMap, ContextNetwork, LinearActionMap
+from nht.maps import ActionMap, LinearActionMap
+from nht.networks import ContextNetwork
 
 CONTEXT_DIM = 4
 

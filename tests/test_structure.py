@@ -42,6 +42,7 @@ THEIRS = {
 # Within nht, a module imports from lower layers only. Those not named here are members of the family of maps.
 LAYERS = {
     "nht.geometry": 0,
+    "nht.networks": 0,
     "nht.episodes": 0,
     "nht.demos": 1,
     "nht.maps": 1,

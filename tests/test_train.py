@@ -9,7 +9,8 @@ from torch import Tensor
 import nht
 from nht import train
 from nht.demos import Demos
-from nht.maps import ActionMap, ContextNetwork, LinearActionMap
+from nht.maps import ActionMap, LinearActionMap
+from nht.networks import ContextNetwork
 from nht.train import projection_error, split_episodes, train_map
 
 N, K, CONTEXT_DIM, EPISODES, LENGTH = 6, 2, 3, 40, 50

@@ -279,6 +279,7 @@ def test_an_action_that_is_not_finite_is_no_success():
     outcome = task.step(np.array([np.full(7, np.nan), STILL]))
     assert outcome.success.tolist() == [False, True]
     assert outcome.failure.tolist() == [True, False]
+    assert outcome.reward.tolist() == [-1, 0]
 
 
 def test_goals_lie_in_their_area_and_differ():
