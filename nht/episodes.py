@@ -7,14 +7,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 FLAGS = ("terminated", "truncated", "done", "success")
-EPISODE_KEYS: tuple[NestedKey, ...] = (
-    "episode",
-    ("collector", "traj_ids"),
-)  # of TorchRL's data sets, collectors
-MASK_KEYS: tuple[NestedKey, ...] = (
-    "mask",
-    ("collector", "mask"),
-)  # false on the padding of split trajectories
+# TorchRL's data sets and its collectors number their episodes, and mark as false the padding of split ones.
+EPISODE_KEYS: tuple[NestedKey, ...] = ("episode", ("collector", "traj_ids"))
+MASK_KEYS: tuple[NestedKey, ...] = ("mask", ("collector", "mask"))
 
 
 def whole_episodes(
@@ -44,6 +39,9 @@ def whole_episodes(
         KeyError: on a key that is not in the data; the message lists those that are.
         ValueError: if nothing says where episodes end, or none does.
     """
+    if data.batch_dims == 0:
+        raise ValueError("transitions need a batch size (T,) or (N, T), got ()")
+    data = data.cpu()
     first = torch.zeros(data.batch_size, dtype=torch.bool)
     first[..., :1] = True
     mask = _first_of(data, MASK_KEYS)

@@ -1,8 +1,9 @@
-"""Demonstrations from a task's scripted expert, a trained policy, or others' files.
+r"""Demonstrations from a task's scripted expert, a trained policy, or others' files.
 
 python -m nht.recipes.collect_demos env=wam_wipe demos.transitions=20000 out=runs/demos
 python -m nht.recipes.collect_demos source=policy source.path=runs/ddpg-wam_wipe-nht-seed0 out=runs/policy-demos
-python -m nht.recipes.collect_demos source=minari source.path=mujoco/halfcheetah/expert-v0 env.name=half_cheetah ...
+python -m nht.recipes.collect_demos source=minari source.path=D4RL/door/human-v2 env.name=AdroitHandDoor \
+    'env.context_keys=[observation]' out=runs/door-demos
 """
 
 from __future__ import annotations

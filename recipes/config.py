@@ -38,7 +38,7 @@ class SourceConfig:
     kind: str = "expert"  # expert, policy, minari, hdf5 or tensordict
     path: str | None = None  # run folder; Minari id, folder or file; HDF5 file; TensorDict folder
     env: str | None = None  # the task's name there, where it is not ours
-    context: dict[str, str] = field(default_factory=dict)  # their key by our name; none: observations
+    context: dict[str, str] = field(default_factory=dict)  # {our name: its key there}; none: observations
     actuation_key: str | None = None  # hdf5, tensordict: None is "actions" and "action"
     episode_key: str | None = None  # hdf5, tensordict: integers that differ between episodes
     done_key: str | None = None  # hdf5, tensordict: true at an episode's last step; None takes the usual ones

@@ -145,7 +145,7 @@ def draw(episodes: Episodes, directions: int) -> Figure:
     actuation = data["actuation"]
     colours = _colours(actuation.shape[-1])
     figure = plt.figure(figsize=(13, 7.5), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=[1, 1.15])
+    top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 1.15])[:, 0]
     axes = top.subplots(1, 3)
     _histogram(axes[0], lengths.astype(float), "length of the episode [steps]")
     if "reward" in data:
@@ -154,8 +154,7 @@ def draw(episodes: Episodes, directions: int) -> Figure:
         axes[1].text(0.5, 0.5, "no rewards", ha="center", va="center", color=GREY)
         axes[1].set_axis_off()
     _draw_energy(axes[2], energy(actuation)[:directions])
-    halves: Any = bottom.subfigures(1, 2, width_ratios=[1, 2])  # an array, whatever its stub says
-    motors, traces = halves
+    motors, traces = bottom.subfigures(1, 2, squeeze=False, width_ratios=[1, 2])[0]
     _draw_motors(motors.subplots(), actuation, colours)
     _draw_traces(traces, actuation, lengths, colours)
     figure.suptitle(
