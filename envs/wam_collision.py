@@ -16,9 +16,9 @@ CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER.value
 class ArmGeoms:
     """The spheres, capsules and cylinders that a serial arm of hinges moves, placed for N postures together.
 
-    A geom is a centre, an axis, half a length and a radius; a sphere is a capsule of no length. All are kept as they
-    lie at joint angles 0, and a posture turns them about the joint axes as those lie at joint angles 0, the last
-    joint first (the product of exponentials). What no joint moves is left out.
+    Every geom is a cylinder grown by a margin: a capsule's has no radius, a sphere's no length either, and a cylinder
+    has no margin. All are kept as they lie at joint angles 0, and a posture turns them about the joint axes as those
+    lie at joint angles 0, the last joint first (the product of exponentials). What no joint moves is left out.
 
     Args:
         model: every joint is a hinge, in a body below that of the joint before.
@@ -48,13 +48,17 @@ class ArmGeoms:
         axes = data.geom_xmat[geoms, 2::3]
         self._at_zero = np.stack([data.geom_xpos[geoms].T, axes.T], axis=-1)[..., None]  # (3, G, 2, 1)
         self._planes = [_turned_plane(axis) for axis in data.xaxis]
-        # Centres turn about the hinge, directions about the origin: (joints, 3, 2, 1).
-        self._anchors = np.stack([data.xanchor, np.zeros((model.njnt, 3))], axis=-1)[..., None]
+        # Centres turn about the hinge, directions about the origin: (3, 1, 2, 1) for each hinge beside the origin.
+        shifts = [
+            anchor - (anchor @ axis) * axis for anchor, axis in zip(data.xanchor, data.xaxis, strict=True)
+        ]
+        beside = [np.stack([shift, np.zeros(3)], axis=-1)[:, None, :, None] for shift in shifts]
+        self._anchors = [anchor if np.abs(anchor).max() > 1e-12 else None for anchor in beside]
 
-        types = model.geom_type[geoms]
-        self._radius: Array = model.geom_size[geoms, :1].copy()
+        types, radius = model.geom_type[geoms], model.geom_size[geoms, 0]
         self._half: Array = np.where(types == SPHERE, 0.0, model.geom_size[geoms, 1])[:, None]
-        self._round: NDArray[np.bool_] = (types != CYLINDER)[:, None]
+        self._radius: Array = np.where(types == CYLINDER, radius, 0.0)[:, None]
+        self._margin: Array = np.where(types == CYLINDER, 0.0, radius)[:, None]
 
     def place(self, joint_angle: Array) -> tuple[Array, Array]:
         """Centres [m] and axes of the G geoms at the joint angles ``(N, joints)`` [rad], each ``(3, G, N)``."""
@@ -63,9 +67,12 @@ class ArmGeoms:
         for joint in reversed(range(len(self._moved))):
             moved, anchor = placed[:, : self._moved[joint]], self._anchors[joint]
             i, j = self._planes[joint]
-            x, y = moved[i] - anchor[i], moved[j] - anchor[j]
-            moved[i] = cos[joint] * x - sin[joint] * y + anchor[i]
-            moved[j] = sin[joint] * x + cos[joint] * y + anchor[j]
+            x, y = moved[i], moved[j]
+            if anchor is not None:
+                x, y = x - anchor[i], y - anchor[j]
+            moved[i], moved[j] = cos[joint] * x - sin[joint] * y, sin[joint] * x + cos[joint] * y
+            if anchor is not None:
+                moved += anchor
         return placed[:, :, 0], placed[:, :, 1]
 
     def distance_to_sphere(self, placed: tuple[Array, Array], centre: Array, radius: float) -> Array:
@@ -78,21 +85,20 @@ class ArmGeoms:
         """
         middle, axis = placed
         to_ball = centre[:, None, None] - middle
-        along = np.abs((to_ball * axis).sum(axis=0))
-        beside = np.sqrt(np.maximum((to_ball * to_ball).sum(axis=0) - along * along, 0.0))
-        beyond = along - self._half  # the end of the axis or the cap
-        rounded = np.hypot(beside, np.maximum(beyond, 0.0)) - self._radius
-        beside -= self._radius
-        flat = np.hypot(np.maximum(beside, 0.0), np.maximum(beyond, 0.0))
-        flat += np.minimum(np.maximum(beside, beyond), 0.0)
-        return np.where(self._round, rounded, flat).T - radius
+        along = np.einsum("ign,ign->gn", to_ball, axis)
+        beside = np.einsum("ign,ign->gn", to_ball, to_ball) - along * along
+        # How far beyond the cylinder's side and its cap, negative within.
+        side = np.sqrt(np.maximum(beside, 0.0)) - self._radius
+        cap = np.abs(along) - self._half
+        outside = np.hypot(np.maximum(side, 0.0), np.maximum(cap, 0.0))
+        return (outside + np.minimum(np.maximum(side, cap), 0.0) - (self._margin + radius)).T
 
     def distance_to_floor(self, placed: tuple[Array, Array], height: float) -> Array:
         """Signed distances ``(N, G)`` [m] to everything below a height [m], negative where a geom dips into it."""
         middle, axis = placed
         upright = np.abs(axis[2])
-        rim = np.where(self._round, 1.0, np.sqrt(np.maximum(1.0 - upright * upright, 0.0)))
-        return (middle[2] - height - self._half * upright - self._radius * rim).T
+        rim = self._radius * np.sqrt(np.maximum(1.0 - upright * upright, 0.0))
+        return (middle[2] - self._half * upright - rim - (self._margin + height)).T
 
 
 def _turned_plane(axis: Array) -> tuple[int, int]:
