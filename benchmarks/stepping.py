@@ -77,7 +77,7 @@ class EnvPool(Method):
 def bare(name: str, copies: int, threads: int) -> Iterator[None]:
     task = make_task(name, num_envs=copies)
     visited = random_motion(task)
-    trajectory = task._trajectory.copy()
+    trajectory = np.zeros((copies, task.substeps, task.state.shape[1]))
     models, data = [task.model] * copies, [mujoco.MjData(task.model) for _ in range(threads)]
     with rollout.Rollout(nthread=threads if threads > 1 else 0) as pool:
         while True:
@@ -94,7 +94,7 @@ def random_motion(task: BatchedTask) -> list[tuple[np.ndarray, np.ndarray]]:
     for actuation in random_actuations(task, 64):
         state = task.state.copy()
         outcome = task.step(actuation)
-        visited.append((state, task._control.copy()))
+        visited.append((state, task._control[:, :1].repeat(task.substeps, axis=1)))
         task.reset(np.flatnonzero(outcome.terminated | outcome.truncated))
     return visited[32:]
 
