@@ -214,7 +214,7 @@ def test_what_cannot_be_wrapped(map: Any) -> None:
 @pytest.mark.parametrize("map", [LASER, CORRECTED])
 def test_what_has_no_axes(map: ActionMap) -> None:
     with pytest.raises(TypeError, match=f"linear in the action has axes to turn, got {type(map).__name__}"):
-        nht.align(map, torch.eye(N, 2), torch.zeros(CONTEXT_DIM))  # type: ignore[arg-type]
+        nht.align(map, torch.eye(N, 2), torch.zeros(CONTEXT_DIM))
 
 
 @pytest.mark.parametrize(
