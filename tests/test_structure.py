@@ -23,10 +23,12 @@ OURS = {
     "nht.recipes": set(FOLDERS),
     "nht.configs": set(),
 }
-# Others' packages, beside the standard library. Recipes may use any.
+# Others' packages, beside the standard library, of a package or of a module in it. Recipes may use any.
 THEIRS = {
     "nht": {"minari", "numpy", "safetensors", "tensordict", "torch", "torchrl.data"},
     "nht.transforms": {"tensordict", "torch", "torchrl"},
+    "nht.transforms.action_map_wrapper": {"gymnasium", "numpy", "tensordict", "torch"},
+    "nht.transforms.arguments": {"tensordict", "torch"},
     "nht.envs": {"dm_control", "gymnasium", "mujoco", "numpy", "tensordict", "torch", "torchrl"},
     "nht.configs": set(),
 }
@@ -70,6 +72,7 @@ def test_imports_form_no_circle():
         ("nht.demos", "import hydra"),
         ("nht.transforms.action_map", "from nht.envs import make_env"),
         ("nht.transforms.action_map", "import transforms.other"),
+        ("nht.transforms.action_map_wrapper", "from torchrl.envs import Transform"),
         ("nht.envs.wam", "import nht"),
         ("nht.envs.wam", "from nht.transforms import ActionMapTransform"),
     ],
@@ -162,4 +165,4 @@ def may_import(module: str, imported: str) -> bool:
         return package_of(imported) in OURS[package]
     if package == "nht.recipes" or imported.split(".")[0] in sys.stdlib_module_names:
         return True
-    return any(is_within(imported, allowed) for allowed in THEIRS[package])
+    return any(is_within(imported, allowed) for allowed in THEIRS.get(module, THEIRS[package]))
