@@ -2,6 +2,7 @@
 
 from nht.envs.experts import Expert
 from nht.envs.gymnasium_env import GYMNASIUM_IDS, GymnasiumEnv, register
+from nht.envs.gymnasium_vector import GymnasiumVectorEnv
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.registry import EXPERTS, TASKS, make_env, make_expert, make_task
 from nht.envs.task import BatchedTask, Outcome
@@ -14,6 +15,7 @@ __all__ = [
     "BatchedTask",
     "Expert",
     "GymnasiumEnv",
+    "GymnasiumVectorEnv",
     "Outcome",
     "make_env",
     "make_expert",

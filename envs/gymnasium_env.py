@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import inspect
+import sys
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from nht.envs.registry import TASKS, make_task
 from nht.envs.rendering import SceneRenderer
+from nht.envs.task import BatchedTask
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"]}
+FLAGS = ("success", "failure", "diverged")
+"""What ``info`` says of a step, beside the task's raw keys."""
 
 
 class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One copy of a task. ``info`` holds the flags ``success``, ``failure`` and ``diverged``, and the raw keys.
+
+    It truncates only if ``options`` has ``max_episode_steps``: ``gymnasium.make`` adds the task's time limit, or its
+    own ``max_episode_steps`` in its place.
 
     Args:
         task: a key of ``nht.envs.TASKS``.
@@ -31,19 +40,13 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     spec: EnvSpec | None
 
     def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(
-                f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}."
-            )
+        check_render_mode(render_mode)
         # Gymnasium's rule: without a seed, every environment draws its own.
         options.setdefault("seed", int(self.np_random.integers(2**31)))
-        self.task = make_task(task, num_envs=1, **options)
-        self.metadata = METADATA | {"render_fps": round(1 / self.task.time_per_step)}
+        self.task = make_task(task, num_envs=1, **{"max_episode_steps": sys.maxsize} | options)
+        self.metadata = metadata_of(self.task)
         self.render_mode = render_mode
-        low, high = (bound.astype(np.float32) for bound in self.task.actuation_bounds)
-        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
-        size = self.task.observation_sizes["observation"]
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), dtype=np.float32)
+        self.observation_space, self.action_space = spaces_of(self.task)
         self._renderer: SceneRenderer | None = None
 
     def reset(
@@ -55,7 +58,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.task.seed(seed)
         self.task.reset()
         observation, raw = self._observe()
-        return observation, raw | {"success": False, "failure": False, "diverged": False}
+        return observation, raw | dict.fromkeys(FLAGS, False)
 
     def step(
         self, action: NDArray[np.float32]
@@ -63,7 +66,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Advance by one environment step with the actuation ``action`` ``(n,)``."""
         outcome = self.task.step(np.asarray(action, dtype=np.float64)[None])
         observation, raw = self._observe()
-        flags = {name: bool(getattr(outcome, name)[0]) for name in ("success", "failure", "diverged")}
+        flags = {name: bool(getattr(outcome, name)[0]) for name in FLAGS}
         reward = float(outcome.reward[0])
         return observation, reward, bool(outcome.terminated[0]), bool(outcome.truncated[0]), raw | flags
 
@@ -86,6 +89,26 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.task.close()
 
 
+def check_render_mode(render_mode: str | None) -> None:
+    """Raise ValueError for a render mode that tasks do not have."""
+    if render_mode not in (None, *METADATA["render_modes"]):
+        raise ValueError(
+            f"render_mode must be None or one of {METADATA['render_modes']}, got {render_mode!r}."
+        )
+
+
+def metadata_of(task: BatchedTask) -> dict[str, Any]:
+    """Gymnasium's metadata: videos run at real time."""
+    return METADATA | {"render_fps": round(1 / task.time_per_step)}
+
+
+def spaces_of(task: BatchedTask) -> tuple[Box[np.float32], Box[np.float32]]:
+    """Observation and action space of one copy."""
+    low, high = (bound.astype(np.float32) for bound in task.actuation_bounds)
+    size = task.observation_sizes["observation"]
+    return Box(-np.inf, np.inf, (size,), dtype=np.float32), Box(low, high, dtype=np.float32)
+
+
 GYMNASIUM_IDS = {
     "ant": "nht/Ant-v0",
     "half_cheetah": "nht/HalfCheetah-v0",
@@ -98,12 +121,13 @@ GYMNASIUM_IDS = {
 
 
 def register() -> None:
-    """Make every task known to ``gymnasium.make``. The tasks truncate by themselves."""
-    for task in TASKS:
+    """Make every task known to ``gymnasium.make`` and ``gymnasium.make_vec``, with its time limit."""
+    for task, kind in TASKS.items():
         if GYMNASIUM_IDS[task] not in gymnasium.registry:
             gymnasium.register(
                 GYMNASIUM_IDS[task],
                 entry_point="nht.envs.gymnasium_env:GymnasiumEnv",
+                vector_entry_point="nht.envs.gymnasium_vector:GymnasiumVectorEnv",
                 kwargs={"task": task},
-                order_enforce=True,
+                max_episode_steps=inspect.signature(kind).parameters["max_episode_steps"].default,
             )

@@ -5,6 +5,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+import stable_baselines3.common.env_checker
 import torch
 from gymnasium.utils.env_checker import check_env
 from torchrl.envs import GymEnv
@@ -34,6 +35,23 @@ def env(name):
 @pytest.mark.filterwarnings("error")
 def test_passes_gymnasiums_checker(env):
     check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized Box:UserWarning")
+@pytest.mark.filterwarnings("error")
+def test_passes_stable_baselines3s_checker(env):
+    stable_baselines3.common.env_checker.check_env(env)
+
+
+@pytest.mark.parametrize("options", [{}, {"max_episode_steps": 3}, {"max_episode_steps": 1_500}])
+def test_the_time_limit_is_the_tasks_or_what_is_asked_for(options):
+    env = gymnasium.make("nht/HalfCheetah-v0", **options)
+    limit = options.get("max_episode_steps", 1_000)
+    assert env.spec.max_episode_steps == limit
+    env.reset(seed=0)
+    still = np.zeros(6, dtype=np.float32)
+    flags = [env.step(still)[2:4] for _ in range(limit)]
+    assert flags == [(False, False)] * (limit - 1) + [(False, True)]
 
 
 def test_spaces(name, env):

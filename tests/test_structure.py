@@ -23,7 +23,7 @@ OURS = {
     "nht.recipes": set(FOLDERS),
     "nht.configs": set(),
 }
-# Others' packages, beside the standard library. Recipes may use any.
+# Others' packages, beside the standard library, of a package or of a module in it. Recipes may use any.
 THEIRS = {
     "nht": {
         "gymnasium.spaces",
@@ -36,6 +36,8 @@ THEIRS = {
         "torchrl.data",
     },
     "nht.transforms": {"tensordict", "torch", "torchrl"},
+    "nht.transforms.action_map_wrapper": {"gymnasium", "numpy", "tensordict", "torch"},
+    "nht.transforms.arguments": {"tensordict", "torch"},
     "nht.envs": {"dm_control", "gymnasium", "mujoco", "numpy", "tensordict", "torch", "torchrl"},
     "nht.configs": set(),
 }
@@ -81,6 +83,7 @@ def test_imports_form_no_circle():
         ("nht.demos", "import hydra"),
         ("nht.transforms.action_map", "from nht.envs import make_env"),
         ("nht.transforms.action_map", "import transforms.other"),
+        ("nht.transforms.action_map_wrapper", "from torchrl.envs import Transform"),
         ("nht.envs.wam", "import nht"),
         ("nht.envs.wam", "from nht.transforms import ActionMapTransform"),
     ],
@@ -173,4 +176,4 @@ def may_import(module: str, imported: str) -> bool:
         return package_of(imported) in OURS[package]
     if package == "nht.recipes" or imported.split(".")[0] in sys.stdlib_module_names:
         return True
-    return any(is_within(imported, allowed) for allowed in THEIRS[package])
+    return any(is_within(imported, allowed) for allowed in THEIRS.get(module, THEIRS[package]))

@@ -1,6 +1,5 @@
 """Put an action map between policy and environment: the policy acts in k dimensions, n motors move."""
 
-import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from nht import ActionMap, load_map
+from nht.transforms.arguments import frozen_copy, resolve_action_scale, resolve_context_keys
 from nht.transforms.context import (
     ContextSnapshot,
     check_context,
@@ -90,9 +90,7 @@ class ActionMapTransform(Transform):
         executed_key: NestedKey = "actuation",
         forward_only: bool = False,
     ) -> None:
-        if not isinstance(map, ActionMap):
-            raise TypeError(f"map must be an nht.ActionMap, got {type(map).__name__}")
-        keys = _resolve_context_keys(map, context_keys)
+        keys = resolve_context_keys(map, context_keys)
         action_key, actuation_key = unravel_key(action_key), unravel_key(actuation_key)
         context_key, executed_key = unravel_key(context_key), unravel_key(executed_key)
         if forward_only:
@@ -101,11 +99,9 @@ class ActionMapTransform(Transform):
             _check_distinct({action_key, actuation_key}, context_key, executed_key)
             out_keys = [context_key, executed_key] if keys else [executed_key]
             super().__init__(keys, out_keys, in_keys_inv=[actuation_key], out_keys_inv=[action_key])
-        scale = torch.as_tensor(map.action_scale if action_scale is None else action_scale)
-        if scale.ndim or not scale.isfinite() or scale <= 0:
-            raise ValueError(f"action_scale must be a positive, finite number, got {scale.tolist()}")
-        self.map = copy.deepcopy(map).requires_grad_(False).eval()
-        self.register_buffer("action_scale", scale.detach().to(map.action_scale, copy=True))
+        scale = resolve_action_scale(map, action_scale)
+        self.map = frozen_copy(map)
+        self.register_buffer("action_scale", scale)
         # The bounds belong to the environment: found on attaching, not saved.
         self.register_buffer("_low", None, persistent=False)
         self.register_buffer("_high", None, persistent=False)
@@ -244,23 +240,6 @@ class ActionMapTransform(Transform):
         if self.actuation_key in base.full_action_spec.keys(True, True):
             spec = base.full_action_spec[self.actuation_key]  # what other transforms make of it is executed
         self._executed_spec = Unbounded(spec.shape[batch_dims:], dtype=spec.dtype, device=spec.device)
-
-
-def _resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> list[NestedKey]:
-    own = None if map.context_keys is None else [unravel_key(key) for key in map.context_keys]
-    if given is None:
-        if own is None and map.context_dim:
-            raise ValueError(
-                f"context_keys must name the entries that make up the map's context of {map.context_dim}: "
-                "the map does not know them, as it was not trained on demonstrations"
-            )
-        return own if own and map.context_dim else []
-    keys = [unravel_key(key) for key in ([given] if isinstance(given, str) else given)]
-    if own is not None and keys != own and set(keys) == set(own):
-        raise ValueError(f"the map was trained on context_keys {own}, in this order; got {keys}")
-    if bool(keys) != bool(map.context_dim):
-        raise ValueError(f"the map's context has {map.context_dim} entries, got context_keys {keys}")
-    return keys
 
 
 def _check_distinct(action_keys: set[NestedKey], context_key: NestedKey, executed_key: NestedKey) -> None:
