@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
+from nht.envs.dm_control import make_dm_control
 from nht.envs.experts import Expert, WipeExpert
+from nht.envs.foreign import ForeignEnv
+from nht.envs.gymnasium_mujoco import make_gymnasium
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.task import BatchedTask
 from nht.envs.wam import WAMWipe
@@ -17,6 +21,9 @@ TASKS: dict[str, type[BatchedTask]] = {"wam_wipe": WAMWipe}
 
 EXPERTS: dict[str, type[Expert]] = {"wam_wipe": WipeExpert}
 """The scripted demonstrator of every task that has one."""
+
+FOREIGN: dict[str, Callable[..., ForeignEnv]] = {"dm_control": make_dm_control, "gymnasium": make_gymnasium}
+"""What makes the tasks of other libraries, by the name of the library."""
 
 
 class UnknownOptionError(ValueError, TypeError):

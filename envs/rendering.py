@@ -13,6 +13,7 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
+from nht.envs.foreign import ForeignTask
 from nht.envs.task import BatchedTask
 
 
@@ -33,16 +34,7 @@ class SceneRenderer:
         self.task = task
         self.camera = camera
         self._data = mujoco.MjData(task.model)
-        _prefer_offscreen_platform()
-        try:
-            self._renderer = mujoco.Renderer(task.model, height, width)
-        except Exception as error:
-            raise RuntimeError(
-                "offscreen rendering needs OpenGL: install EGL (Debian: libegl1 libgl1-mesa-dri), or OSMesa "
-                "(libosmesa6) and set MUJOCO_GL=osmesa before Python starts."
-            ) from error
-        # At exit MuJoCo ends EGL; what the collector frees after that prints a traceback.
-        atexit.register(_close, weakref.ref(self._renderer))
+        self._renderer = _open_renderer(task.model, width, height)
 
     def frame(self, row: int = 0) -> NDArray[np.uint8]:
         """The copy ``row`` as it stands now, ``(height, width, 3)``."""
@@ -56,6 +48,48 @@ class SceneRenderer:
     def close(self) -> None:
         """Release the OpenGL context."""
         self._renderer.close()
+
+
+class ForeignRenderer:
+    """Renders copies of an environment of another library, each with its own model: they may differ.
+
+    Args:
+        task: the simulators to look at.
+        width: picture width [pixel].
+        height: picture height [pixel].
+
+    Raises:
+        RuntimeError: if this machine has no OpenGL for offscreen rendering; the message says what to install.
+    """
+
+    def __init__(self, task: ForeignTask, width: int = 640, height: int = 480) -> None:
+        self.task = task
+        self._renderers = [_open_renderer(copy.model, width, height) for copy in task.copies]
+
+    def frame(self, row: int = 0) -> NDArray[np.uint8]:
+        """The copy ``row`` as it stands now, through the model's first camera, ``(height, width, 3)``."""
+        copy, renderer = self.task.copies[row], self._renderers[row]
+        renderer.update_scene(copy.data, camera=0 if copy.model.ncam else -1)
+        return renderer.render()
+
+    def close(self) -> None:
+        """Release the OpenGL contexts."""
+        for renderer in self._renderers:
+            renderer.close()
+
+
+def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    _prefer_offscreen_platform()
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except Exception as error:
+        raise RuntimeError(
+            "offscreen rendering needs OpenGL: install EGL (Debian: libegl1 libgl1-mesa-dri), or OSMesa "
+            "(libosmesa6) and set MUJOCO_GL=osmesa before Python starts."
+        ) from error
+    # At exit MuJoCo ends EGL; what the collector frees after that prints a traceback.
+    atexit.register(_close, weakref.ref(renderer))
+    return renderer
 
 
 def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:

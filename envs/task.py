@@ -6,6 +6,7 @@ A task is the physics-facing half of an environment. It knows neither TorchRL no
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,6 +61,9 @@ class BatchedTask(ABC):
     observation_sizes: ClassVar[dict[str, int]]
     """Length of every observation by its key; ``"observation"`` is what a policy sees."""
 
+    reward_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+    """Smallest and largest reward of a step."""
+
     def __init__(
         self,
         model: mujoco.MjModel,
@@ -93,6 +97,11 @@ class BatchedTask(ABC):
         self._control: Array = np.zeros((num_envs, substeps, model.nu))
         self._trajectory: Array = np.zeros((num_envs, substeps, self.state.shape[1]))
         self._rollout: rollout.Rollout | None = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
+
+    @property
+    def time_per_step(self) -> float:
+        """Simulated time of one environment step [s]."""
+        return self.substeps * self.model.opt.timestep
 
     def seed(self, seed: int) -> None:
         """Start the generator of all random draws anew."""

@@ -14,7 +14,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from nht.envs.rendering import SceneRenderer
+from nht.envs.foreign import ForeignTask
+from nht.envs.rendering import ForeignRenderer, SceneRenderer
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -72,8 +73,9 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
         RuntimeError: if this machine cannot render offscreen.
     """
     task = env.base_env.task
-    renderer = SceneRenderer(task, width=480, height=360)
-    frames_per_second = round(1 / (task.substeps * task.model.opt.timestep))
+    of_its_kind = ForeignRenderer if isinstance(task, ForeignTask) else SceneRenderer
+    renderer = of_its_kind(task, width=480, height=360)
+    frames_per_second = round(1 / task.time_per_step)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with imageio.get_writer(path, fps=frames_per_second, macro_block_size=8) as writer:
