@@ -10,6 +10,7 @@ from torchrl.data import Bounded
 from torchrl.envs import DMControlEnv, EnvBase
 
 from nht.envs.foreign import ForeignEnv, MujocoCopy
+from nht.envs.task import Array
 
 
 def make_dm_control(
@@ -43,6 +44,13 @@ def suite_module(domain: str) -> Any:
     except ImportError as error:
         raise ImportError("tasks of dm_control need its package: pip install 'nht[dm_control]'.") from error
     return getattr(suite, domain)
+
+
+def tolerance(values: Array, bounds: tuple[float, float], margin: float, **options: Any) -> Array:
+    """The suite's building block of rewards: 1 within the bounds, falling to 0 outside, for many values at once."""
+    from dm_control.utils import rewards
+
+    return rewards.tolerance(values, bounds, margin, **options)
 
 
 def _domain_and_task(name: str) -> tuple[str, str]:

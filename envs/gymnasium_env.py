@@ -88,8 +88,10 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 GYMNASIUM_IDS = {
     "ant": "nht/Ant-v0",
+    "cheetah_run": "nht/CheetahRun-v0",
     "half_cheetah": "nht/HalfCheetah-v0",
     "hopper": "nht/Hopper-v0",
+    "manipulator_bring_ball": "nht/ManipulatorBringBall-v0",
     "walker2d": "nht/Walker2d-v0",
     "wam_wipe": "nht/WAMWipe-v0",
 }

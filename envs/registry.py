@@ -9,19 +9,23 @@ from typing import Any
 import torch
 
 from nht.envs.ant import Ant
+from nht.envs.cheetah import CheetahRun
 from nht.envs.dm_control import make_dm_control
 from nht.envs.experts import Expert, WipeExpert
 from nht.envs.foreign import ForeignEnv
 from nht.envs.gymnasium_mujoco import make_gymnasium
 from nht.envs.locomotion import HalfCheetah, Hopper, Walker2d
+from nht.envs.manipulator import BringBall
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.task import BatchedTask
 from nht.envs.wam import WAMWipe
 
 TASKS: dict[str, type[BatchedTask]] = {
     "ant": Ant,
+    "cheetah_run": CheetahRun,
     "half_cheetah": HalfCheetah,
     "hopper": Hopper,
+    "manipulator_bring_ball": BringBall,
     "walker2d": Walker2d,
     "wam_wipe": WAMWipe,
 }

@@ -27,7 +27,16 @@ OURS = {
 THEIRS = {
     "nht": {"minari", "numpy", "safetensors", "tensordict", "torch", "torchrl.data"},
     "nht.transforms": {"tensordict", "torch", "torchrl"},
-    "nht.envs": {"dm_control", "gymnasium", "mujoco", "numpy", "tensordict", "torch", "torchrl"},
+    "nht.envs": {
+        "dm_control",
+        "gymnasium",
+        "gymnasium_robotics",
+        "mujoco",
+        "numpy",
+        "tensordict",
+        "torch",
+        "torchrl",
+    },
     "nht.configs": set(),
 }
 # Within nht, a module imports from lower layers only. Those not named here are members of the family of maps.
