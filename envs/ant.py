@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import mujoco
@@ -23,8 +24,8 @@ class Ant(Locomotion):
     ``contact_cost_weight=0``, and pays the healthy reward also when falling.
 
     Gymnasium reads the torso's position and the forces where MuJoCo computed them last. With Ant's Runge-Kutta
-    integrator that is not the state in which a step ends, but the fourth stage of its last simulation step, and
-    ``mujoco.rollout`` returns states only. So the stages are computed once more, for all copies at once.
+    integrator that is not the state in which a step ends, but the fourth stage of its last substep, and
+    ``mujoco.rollout`` returns states only. So that substep is taken here, stage by stage, for all copies at once.
 
     Args:
         num_envs, num_threads, seed, forward_reward_weight, ctrl_cost_weight, reset_noise_scale, max_episode_steps:
@@ -79,9 +80,11 @@ class Ant(Locomotion):
         )
 
     def _prepare(self) -> None:
+        kept_back = 1  # substep
+        self._control = self._control[:, kept_back:].copy()
+        self._trajectory = self._trajectory[:, kept_back:].copy()
         self._sensing = sensing_model(self.file)
         self._sensing_data = [mujoco.MjData(self._sensing) for _ in range(self.num_threads)]
-        self._stage: Array = np.zeros_like(self.state)
         self._after: Array = np.zeros((self.num_envs, 1, self.state.shape[1]))
         self._sensed: Array = np.zeros((self.num_envs, 1, self._sensing.nsensordata))
         self.torso_x: Array = np.zeros(self.num_envs)
@@ -131,38 +134,54 @@ class Ant(Locomotion):
 
     def _advance(self, applied: Array) -> Flags:
         diverged = super()._advance(applied)
-        self._visit_stages(np.where(diverged[:, None], self.state, self._trajectory[:, -2]))
+        self._forget_last_step(np.flatnonzero(diverged))
         return diverged
 
-    def _visit_stages(self, state: Array) -> None:
-        """Read torso and contacts at the last Runge-Kutta stage of the simulation step from ``state``."""
-        positions, step = self.model.nq, self.model.opt.timestep
-        q, v = state[:, 1 : 1 + positions], state[:, 1 + positions :]
-        half_step = step / 2
-        v_second = v + half_step * self._acceleration(q, v)
-        v_third = v + half_step * self._acceleration(moved(q, v, half_step), v_second)
-        self.torso_x = q[:, 0] + step * v_third[:, 0]
-        if self.include_cfrc_ext_in_observation or self.contact_cost_weight:
-            v_fourth = v + step * self._acceleration(moved(q, v_second, half_step), v_third)
-            self._acceleration(moved(q, v_third, step), v_fourth)
-            self.contact_force = self._external_forces().clip(*self.contact_force_range)
+    def _complete(self, after: Array) -> Array:
+        """Take the last substep by the four stages of the classical Runge-Kutta method, as MuJoCo does."""
+        time, q, v_1 = after[:, :1], after[:, 1 : 1 + self.model.nq], after[:, 1 + self.model.nq :]
+        step, before = self.model.opt.timestep, self._trajectory[:, -2, 1 + self.model.nq :]
+        a_1 = self._acceleration(q, v_1, guess=(v_1 - before) / step)
+        v_2 = v_1 + step / 2 * a_1
+        a_2 = self._acceleration(moved(q, v_1, step / 2), v_2, guess=a_1)
+        v_3 = v_1 + step / 2 * a_2
+        a_3 = self._acceleration(moved(q, v_2, step / 2), v_3, guess=a_2)
+        v_4 = v_1 + step * a_3
+        q_4 = moved(q, v_3, step)
+        a_4 = self._acceleration(q_4, v_4, guess=a_3)
+        self.torso_x = q_4[:, 0].copy()
+        self.contact_force = self._external_forces().clip(*self.contact_force_range)
 
-    def _acceleration(self, q: Array, v: Array) -> Array:
-        """Acceleration ``(N, nv)`` of all copies at a state; leaves what the sensors read there."""
+        position = moved(q, (v_1 + 2 * v_2 + 2 * v_3 + v_4) / 6, step)
+        velocity = v_1 + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
+        return np.concatenate([time + step, position, velocity], axis=1)
+
+    def _acceleration(self, q: Array, v: Array, guess: Array) -> Array:
+        """Acceleration ``(N, nv)`` of all copies at a state; leaves behind what the sensors read there.
+
+        Args:
+            q: positions ``(N, nq)``.
+            v: velocities ``(N, nv)``.
+            guess: acceleration ``(N, nv)`` that the solver starts from.
+        """
         assert self._rollout is not None
-        self._stage[:] = np.concatenate([np.zeros((self.num_envs, 1)), q, v], axis=1)
+        time = np.ones((self.num_envs, 1))
         self._rollout.rollout(
             [self._sensing] * self.num_envs,
             self._sensing_data,
-            self._stage,
+            np.concatenate([time, q, v], axis=1),
             self._control[:, :1].copy(),
             control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
             skip_checks=True,
             nstep=1,
+            initial_warmstart=guess,
             state=self._after,
             sensordata=self._sensed,
         )
-        return (self._after[:, 0, -v.shape[1] :] - v) / self.model.opt.timestep
+        after = self._after[:, 0]
+        acceleration = (after[:, -v.shape[1] :] - v) / self.model.opt.timestep
+        acceleration[after[:, 0] < 1] = math.nan  # MuJoCo answers bad numbers by a reset, of the clock too
+        return acceleration
 
     def _external_forces(self) -> Array:
         """MuJoCo's ``cfrc_ext``: torque about the robot's centre of mass and force on each body, ``(N, 6 bodies)``."""

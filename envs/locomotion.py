@@ -111,7 +111,8 @@ class Locomotion(BatchedTask):
 
     def observe(self) -> dict[str, Array]:
         """All positions but where on the floor, and velocities [m, rad, m/s, rad/s]; those of the driven joints."""
-        velocity = self.qvel.clip(-self.velocity_clip, self.velocity_clip)
+        clip = self.velocity_clip
+        velocity = self.qvel if clip == math.inf else self.qvel.clip(-clip, clip)
         driven = self.model.nu
         return {
             "observation": np.concatenate([self.qpos[:, self.hidden :], velocity], axis=1),

@@ -85,6 +85,8 @@ class BatchedTask(ABC):
         self.substeps = substeps
         self.max_episode_steps = max_episode_steps
         self.num_threads = num_threads
+        self.time_per_step: float = substeps * model.opt.timestep
+        """Simulated time of one environment step [s]."""
         self.seed(seed)
 
         full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -101,11 +103,6 @@ class BatchedTask(ABC):
         self.sensors: Array = np.zeros((num_envs, model.nsensordata if self.reads_sensors else 0))
         self._sensor_trajectory = np.zeros((num_envs, substeps, self.sensors.shape[1]))
         self._rollout: rollout.Rollout | None = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
-
-    @property
-    def time_per_step(self) -> float:
-        """Simulated time of one environment step [s]."""
-        return self.substeps * self.model.opt.timestep
 
     def seed(self, seed: int) -> None:
         """Start the generator of all random draws anew."""
@@ -195,14 +192,14 @@ class BatchedTask(ABC):
             self._control,
             control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
             skip_checks=True,
-            nstep=self.substeps,
+            nstep=self._control.shape[1],
             state=self._trajectory,
             sensordata=self._sensor_trajectory if self.reads_sensors else None,
         )
-        after = self._trajectory[:, -1]
+        after = self._complete(self._trajectory[:, -1])
         # MuJoCo answers bad numbers by a reset of the simulation and then stands still: its clock falls behind.
         elapsed = after[:, 0] - self.state[:, 0]
-        expected = (self.substeps - 0.5) * self.model.opt.timestep
+        expected = (1 - 0.5 / self.substeps) * self.time_per_step
         diverged = ~(np.isfinite(after).all(axis=1) & (elapsed > expected))
         if diverged.any():
             after = np.where(diverged[:, None], self.state, after)
@@ -210,6 +207,10 @@ class BatchedTask(ABC):
         if self.reads_sensors:
             self.sensors[~diverged] = self._sensor_trajectory[~diverged, -1]
         return diverged
+
+    def _complete(self, after: Array) -> Array:
+        """Take the substeps that a task keeps from ``rollout``, none by default, from the state ``(N, ..)`` it left."""
+        return after
 
     def set_state(
         self, qpos: Array, qvel: Array, rows: NDArray[np.intp] | None = None, *, tolerance: float = 0.1
