@@ -111,8 +111,10 @@ def spaces_of(task: BatchedTask) -> tuple[Box[np.float32], Box[np.float32]]:
 
 GYMNASIUM_IDS = {
     "ant": "nht/Ant-v0",
+    "cheetah_run": "nht/CheetahRun-v0",
     "half_cheetah": "nht/HalfCheetah-v0",
     "hopper": "nht/Hopper-v0",
+    "manipulator_bring_ball": "nht/ManipulatorBringBall-v0",
     "walker2d": "nht/Walker2d-v0",
     "wam_grasp": "nht/WAMGrasp-v0",
     "wam_wipe": "nht/WAMWipe-v0",

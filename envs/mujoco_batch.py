@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -42,10 +43,17 @@ class BatchedMujocoEnv(EnvBase):
         }
         flags = {name: flag.clone() for name in ("success", "failure", "diverged")}
         self.observation_spec = Composite({**observations, **flags}, shape=batch)
-        self.reward_spec = Unbounded((*batch, 1), dtype=torch.float32, device=device)
+        self.reward_spec = self._reward_spec()
         self.done_spec = Composite(
             {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=batch
         )
+
+    def _reward_spec(self) -> Bounded | Unbounded:
+        low, high = self.task.reward_range
+        shape = (*self.batch_size, 1)
+        if math.isinf(low) or math.isinf(high):
+            return Unbounded(shape, dtype=torch.float32, device=self.device)
+        return Bounded(low, high, shape, dtype=torch.float32, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         rows = None

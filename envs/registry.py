@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from nht.envs.ant import Ant
+from nht.envs.cheetah import CheetahRun
+from nht.envs.dm_control import make_dm_control
 from nht.envs.experts import Expert, GraspExpert, WipeExpert
+from nht.envs.foreign import ForeignEnv
+from nht.envs.gymnasium_mujoco import make_gymnasium
 from nht.envs.locomotion import HalfCheetah, Hopper, Walker2d
+from nht.envs.manipulator import BringBall
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.task import BatchedTask
 from nht.envs.wam import WAMWipe
@@ -17,8 +23,10 @@ from nht.envs.wam_grasp import WAMGrasp
 
 TASKS: dict[str, type[BatchedTask]] = {
     "ant": Ant,
+    "cheetah_run": CheetahRun,
     "half_cheetah": HalfCheetah,
     "hopper": Hopper,
+    "manipulator_bring_ball": BringBall,
     "walker2d": Walker2d,
     "wam_grasp": WAMGrasp,
     "wam_wipe": WAMWipe,
@@ -27,6 +35,9 @@ TASKS: dict[str, type[BatchedTask]] = {
 
 EXPERTS: dict[str, type[Expert]] = {"wam_grasp": GraspExpert, "wam_wipe": WipeExpert}
 """The scripted demonstrator of every task that has one."""
+
+FOREIGN: dict[str, Callable[..., ForeignEnv]] = {"dm_control": make_dm_control, "gymnasium": make_gymnasium}
+"""What makes the tasks of other libraries, by the name of the library."""
 
 
 class UnknownOptionError(ValueError, TypeError):

@@ -7,7 +7,9 @@ A task is the physics-facing half of an environment. It knows neither TorchRL no
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -59,6 +61,11 @@ class BatchedTask(ABC):
         ValueError: if a count is below 1.
     """
 
+    reward_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
+    """Smallest and largest reward of a step."""
+    reads_sensors: ClassVar[bool] = False
+    """Whether ``sensors`` is kept, the values of the model's sensors in the state before the last substep."""
+
     def __init__(
         self,
         model: mujoco.MjModel,
@@ -93,6 +100,8 @@ class BatchedTask(ABC):
         self._data = [mujoco.MjData(model) for _ in range(num_threads)]
         self._control: Array = np.zeros((num_envs, substeps, model.nu))
         self._trajectory: Array = np.zeros((num_envs, substeps, self.state.shape[1]))
+        self.sensors: Array = np.zeros((num_envs, model.nsensordata if self.reads_sensors else 0))
+        self._sensor_trajectory = np.zeros((num_envs, substeps, self.sensors.shape[1]))
         self._rollout: rollout.Rollout | None = rollout.Rollout(nthread=num_threads if num_threads > 1 else 0)
 
     def seed(self, seed: int) -> None:
@@ -137,6 +146,8 @@ class BatchedTask(ABC):
         self._check_open()
         rows = np.arange(self.num_envs) if rows is None else rows
         self.state[rows] = 0.0
+        # Not at 0, where MuJoCo puts the clock after bad numbers: one substep later both would look alike.
+        self.state[rows, 0] = self.model.opt.timestep
         self.steps[rows] = 0
         self._draw_start(rows)
 
@@ -187,6 +198,7 @@ class BatchedTask(ABC):
             skip_checks=True,
             nstep=self._control.shape[1],
             state=self._trajectory,
+            sensordata=self._sensor_trajectory if self.reads_sensors else None,
         )
         after = self._complete(self._trajectory[:, -1])
         # MuJoCo answers bad numbers by a reset of the simulation and then stands still: its clock falls behind.
@@ -196,6 +208,8 @@ class BatchedTask(ABC):
         if diverged.any():
             after = np.where(diverged[:, None], self.state, after)
         self.state[:] = after
+        if self.reads_sensors:
+            self.sensors[~diverged] = self._sensor_trajectory[~diverged, -1]
         return diverged
 
     def _complete(self, after: Array) -> Array:
@@ -269,17 +283,26 @@ class BatchedTask(ABC):
 def load_model(path: Path) -> mujoco.MjModel:
     """Compile an MJCF file.
 
+    Raises:
+        ValueError: if it does not compile: the file's name, and MuJoCo's message.
+    """
+    return compile_model(str(path), lambda: mujoco.MjModel.from_xml_path(str(path)))
+
+
+def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjModel:
+    """What ``build`` compiles.
+
     MuJoCo's warnings, which it would also write to a file in the working folder, go to this module's logger.
 
     Raises:
-        ValueError: if it does not compile: the file's name, and MuJoCo's message.
+        ValueError: if it does not compile: the name, and MuJoCo's message.
     """
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(LOGGER.info)
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        return build()
     except ValueError as error:
-        raise ValueError(f"{path} does not compile: {error}") from error
+        raise ValueError(f"{name} does not compile: {error}") from error
     finally:
         mujoco.set_mju_user_warning(previous)
 

@@ -64,6 +64,7 @@ class WAMWipe(BatchedTask):
         "tool_position": 3,
         "goal": 3,
     }
+    reward_range = (-1.0, 0.0)
     _episode_arrays = ("goal", "failed")
 
     def __init__(

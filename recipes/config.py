@@ -14,6 +14,7 @@ class EnvConfig:
     """Which task, and how many copies of it."""
 
     name: str = "wam_wipe"
+    suite: str = "nht"  # whose task it is: nht, dm_control or gymnasium
     context_keys: list[str] = field(default_factory=list)  # what a map sees, in order
     num_envs: int = 10
     num_threads: int = 1
@@ -91,7 +92,7 @@ class DDPGConfig:
     exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
     noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
     random_action: float = 0.1  # probability of a uniform action instead
-    pessimism: float = 0.8  # the critic starts at -pessimism / (1 - gamma)
+    pessimism: float = 0.8  # the critic starts at this times the lowest return that is possible
     observation_clip: float = 5.0  # of the normalised observation
 
     def __post_init__(self) -> None:

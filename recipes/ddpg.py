@@ -16,7 +16,7 @@ from nht.recipes.config import DDPG
 from nht.recipes.environments import mapped_env, run_map, test_env
 from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
-from nht.recipes.losses import PaperDDPGLoss, charge_failure
+from nht.recipes.losses import PaperDDPGLoss, charge_failure, reward_range
 from nht.recipes.networks import ddpg_networks, exploring, save_policy
 from nht.recipes.progress import CollectorState, Counters, TrainingStatistics
 from nht.recipes.run_folder import RunFolder
@@ -46,7 +46,8 @@ def main(config: DDPG) -> None:
     features, actor, critic = ddpg_networks(env, algo)
     policy = TensorDictSequential(features, actor)
 
-    loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2)
+    rewards = reward_range(env)
+    loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
     target = SoftUpdate(loss, eps=algo.polyak)
     optimiser = torch.optim.Adam(
         [
@@ -86,7 +87,7 @@ def main(config: DDPG) -> None:
     progress = run.progress_bar(algo.total_frames, counters.frames)
     training = TrainingStatistics(env.base_env.action_spec.space)
     for data in collector:
-        data = charge_failure(data.reshape(-1), algo.gamma)
+        data = charge_failure(data.reshape(-1), algo.gamma, rewards)
         features.module.update(data["observation"])
         buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
         counters.frames += data.numel()

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
 
 from nht.recipes.config import DDPGConfig
-from nht.recipes.losses import lowest_return
+from nht.recipes.losses import return_range, reward_range
 
 
 class RunningNorm(nn.Module):
@@ -67,14 +67,16 @@ def ddpg_networks(
 
     Returns:
         the normaliser, ``"observation"`` to ``"features"``; the actor, features to an ``"action"`` in [-1, 1]^k; and
-        the critic, features and action to a ``"state_action_value"`` that starts near ``-pessimism / (1 - gamma)``.
+        the critic, features and action to a ``"state_action_value"`` that starts near ``pessimism`` times
+        the lowest return that is possible, or near 0 where rewards know no bound.
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     norm = RunningNorm(size, algo.observation_clip).to(env.device)
     hidden = {"num_cells": list(algo.hidden), "activation_class": nn.ReLU, "device": env.device}
     actor = nn.Sequential(MLP(size, action_dim, **hidden), nn.Tanh())
     critic = MLP(size + action_dim, 1, **hidden)
-    nn.init.constant_(critic[-1].bias, algo.pessimism * lowest_return(algo.gamma))
+    lowest, _ = return_range(reward_range(env), algo.gamma)
+    nn.init.constant_(critic[-1].bias, algo.pessimism * lowest if math.isfinite(lowest) else 0.0)
     return (
         TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
         TensorDictModule(actor, in_keys=["features"], out_keys=["action"]),

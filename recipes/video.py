@@ -14,7 +14,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from nht.envs import BatchedTask
-from nht.envs.rendering import SceneRenderer
+from nht.envs.foreign import ForeignTask
+from nht.envs.rendering import ForeignRenderer, SceneRenderer
 from nht.recipes.evaluation import Evaluation, Policy, evaluate
 
 Picture = NDArray[np.uint8]
@@ -63,13 +64,15 @@ class Film:
         frames_per_second: at which the film runs at the speed of real time.
     """
 
-    def __init__(self, task: BatchedTask) -> None:
-        self.task = task
+    def __init__(self, task: BatchedTask | ForeignTask) -> None:
         self.frames: list[list[Picture]] = []
-        steps_per_second = 1 / (task.substeps * task.model.opt.timestep)
+        steps_per_second = 1 / task.time_per_step
         self._every = math.ceil(steps_per_second / SMOOTH)
         self.frames_per_second = steps_per_second / self._every
-        self._renderer = SceneRenderer(task, *TILE)
+        self._seconds_per_step = task.time_per_step
+        self._renderer = (
+            ForeignRenderer(task, *TILE) if isinstance(task, ForeignTask) else SceneRenderer(task, *TILE)
+        )
         self._trail: list[NDArray[np.float64]] = []
         self._steps = 0
         self._running = np.ones(task.num_envs, dtype=bool)
@@ -77,8 +80,8 @@ class Film:
     def add(self, outcome: TensorDictBase) -> None:
         """Film what a reset or a step has brought, where it is time for a picture or an episode has ended."""
         done, success, failure = (outcome[flag].view(-1).numpy() for flag in ("done", "success", "failure"))
-        if (tool := self.task.observe().get("tool_position")) is not None:
-            self._trail.append(tool)
+        if (tool := outcome.get("tool_position", None)) is not None:
+            self._trail.append(tool.double().numpy())
         if self._steps % self._every == 0 or (done & self._running).any():
             self.frames.append([self._tile(row, success[row], failure[row]) for row in range(len(done))])
         self._running &= ~done
@@ -90,7 +93,7 @@ class Film:
         trail = np.stack([points[row] for points in self._trail[::TRAIL_EVERY]]) if self._trail else None
         state = "failed" if failure else "success" if success else ""
         picture = Image.fromarray(self._renderer.frame(row, trail))
-        seconds = self._steps * self.task.substeps * self.task.model.opt.timestep
+        seconds = self._steps * self._seconds_per_step
         draw = ImageDraw.Draw(picture)
         draw.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=COLOURS[state], width=BORDER)
         draw.text(

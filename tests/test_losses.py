@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from nht.recipes.losses import PaperDDPGLoss, charge_failure, lowest_return
+from nht.recipes.losses import PaperDDPGLoss, charge_failure, return_range
 from nht.recipes.networks import RunningNorm
 
 GAMMA = 0.9
@@ -81,7 +81,7 @@ def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
         batch_size=[4],
     )
     charged = charge_failure(steps, GAMMA)["next", "reward"].squeeze(-1)
-    assert lowest_return(GAMMA) == pytest.approx(-10.0)
+    assert return_range((-1.0, 0.0), GAMMA) == pytest.approx((-10.0, 0.0))
     assert charged.tolist() == pytest.approx([-10.0, -1.0, -1.0, -1.0])
 
 

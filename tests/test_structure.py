@@ -38,7 +38,16 @@ THEIRS = {
     "nht.transforms": {"tensordict", "torch", "torchrl"},
     "nht.transforms.action_map_wrapper": {"gymnasium", "numpy", "tensordict", "torch"},
     "nht.transforms.arguments": {"tensordict", "torch"},
-    "nht.envs": {"dm_control", "gymnasium", "mujoco", "numpy", "tensordict", "torch", "torchrl"},
+    "nht.envs": {
+        "dm_control",
+        "gymnasium",
+        "gymnasium_robotics",
+        "mujoco",
+        "numpy",
+        "tensordict",
+        "torch",
+        "torchrl",
+    },
     "nht.configs": set(),
 }
 # Within nht, a module imports from lower layers only. Those not named here are members of the family of maps.
