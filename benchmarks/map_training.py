@@ -20,8 +20,8 @@ import torch
 from tensordict import TensorDict
 
 import nht
-from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
+from nht.recipes.recording import record_expert
 from nht.recipes.train_map import train_map
 from nht.train import _gradient_steps
 
@@ -82,7 +82,7 @@ def main() -> None:
     rows = []
     with TemporaryDirectory() as scratch:
         demos = DemosConfig(str(Path(scratch) / "demos"))
-        collect_demos(ENV, DemosConfig(transitions=TRANSITIONS), 0, str(demos.path))
+        record_expert(ENV, DemosConfig(transitions=TRANSITIONS), 0, str(demos.path))
         for name, config in MAPS.items():
             start = time.process_time()
             map, metrics = train_map(config, ENV, demos, seed=0)

@@ -23,9 +23,9 @@ import pandas
 import torch
 
 import nht
-from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
 from nht.recipes.environments import mapped_env
+from nht.recipes.recording import record_expert
 from nht.recipes.train_map import train_map
 
 ENV = EnvConfig(context_keys=["tool_position", "joint_angle"])
@@ -89,7 +89,7 @@ def main() -> None:
     rows = []
     with TemporaryDirectory() as scratch:
         demos = DemosConfig(str(Path(scratch) / "demos"))
-        collect_demos(ENV, DemosConfig(), 0, str(demos.path))
+        record_expert(ENV, DemosConfig(), 0, str(demos.path))
         rng = np.random.default_rng(0)
         for index in range(options.configurations):
             settings = draw(rng)

@@ -132,9 +132,9 @@ class WAMGrasp(BatchedTask):
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
         self._update_pose()
         self.failed |= clearance(self._arm, self.qpos) < 0
-        success: Flags = self._at_goal() & ~self.failed
+        success = self._at_goal() & ~self.failed
         ended = (self.failed & self.terminate_on_failure) | (success & self.terminate_on_success)
-        return success - 1.0, ended, success, self.failed.copy()
+        return np.where(success, 0.0, -1.0), ended, success, self.failed.copy()
 
     def _at_goal(self) -> Flags:
         to_goal = self.goal - self._position

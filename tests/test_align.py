@@ -15,8 +15,8 @@ import nht
 from nht.envs import make_env
 from nht.envs.wam_kinematics import forward_kinematics
 from nht.maps import ActionMap, LinearActionMap
-from nht.recipes.collect_demos import collect_demos
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
+from nht.recipes.recording import record_expert
 from nht.recipes.train_map import load_kind, train_map
 from nht.train import projection_error
 from nht.transforms import ActionMapTransform
@@ -164,7 +164,7 @@ def test_an_identity_until_told_otherwise_and_single_precision() -> None:
 
 def test_the_tool_follows_the_axes_of_a_map_trained_on_wam_wipe(tmp_path: Path) -> None:
     task = EnvConfig(context_keys=["tool_position", "joint_angle"], options={"start": "random"})
-    demos = collect_demos(task, DemosConfig(transitions=2000), 0, tmp_path / "demos")
+    demos = record_expert(task, DemosConfig(transitions=2000), 0, tmp_path / "demos")
     settings, folder = MapConfig(hidden=[32], max_steps=500), DemosConfig(path=str(tmp_path / "demos"))
     plain = train_map(settings, task, folder, 3).map
     aligned, metrics = train_map(settings, task, folder, 3, align="tool")
