@@ -81,7 +81,7 @@ def plot(rows: list[Row], name: str) -> None:
     for axis, unit, title in zip(
         axes,
         ("90 %", "env steps/CPU s"),
-        ("per second, best tenth of the rounds", "per processor second"),
+        ("per second (best tenth)", "per processor second"),
         strict=True,
     ):
         for method, colour in (("TorchRL", "C0"), ("bare", "C7")):
@@ -91,9 +91,10 @@ def plot(rows: list[Row], name: str) -> None:
                 axis.plot(
                     [row["copies"] for row in line], [row[unit] for row in line], style, c=colour, label=label
                 )
-        axis.set(xscale="log", yscale="log", xlabel="copies", title=f"{name}: env steps {title}")
+        axis.set(xscale="log", yscale="log", xlabel="copies", title=f"env steps {title}")
         axis.set_xticks(COPIES, [str(copies) for copies in COPIES])
         axis.grid(alpha=0.3)
+    figure.suptitle(f"{name}: growth with the number of copies")
     axes[0].legend()
     figure.savefig(RESULTS.with_suffix(".png"), dpi=120)
 
