@@ -145,6 +145,8 @@ class BatchedTask(ABC):
         """Start a new episode in the copies ``rows`` (all by default) and leave the others alone."""
         self._check_open()
         rows = np.arange(self.num_envs) if rows is None else rows
+        if not len(rows):
+            return
         self.state[rows] = 0.0
         # Not at 0, where MuJoCo puts the clock after bad numbers: one substep later both would look alike.
         self.state[rows, 0] = self.model.opt.timestep

@@ -289,6 +289,14 @@ def test_partial_reset_touches_its_rows_only(name):
     assert (after["observation"] != before["observation"])[mask].any(dim=1).all()
 
 
+def test_a_reset_of_no_copy_changes_nothing(name):
+    task = make_env(name, num_envs=2).task
+    before = task.state.copy(), task.rng.bit_generator.state
+    task.reset(np.array([], dtype=np.intp))
+    np.testing.assert_array_equal(task.state, before[0])
+    assert task.rng.bit_generator.state == before[1]
+
+
 def test_a_finished_copy_starts_anew_and_its_last_observation_stays(name):
     env = make_env(name, num_envs=3, max_episode_steps=10)
     tensordict = env.reset()

@@ -1,12 +1,15 @@
 """What the recipes add to TorchRL's DDPG, against values worked out by hand."""
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 
-from nht.recipes.losses import PaperDDPGLoss, charge_failure, return_range
+from nht.envs import make_env
+from nht.recipes.losses import PaperDDPGLoss, charge_failure, return_range, reward_range
 from nht.recipes.networks import RunningNorm
 
 GAMMA = 0.9
@@ -100,3 +103,31 @@ def test_running_norm_does_not_divide_by_a_vanishing_deviation():
     norm = RunningNorm(1)
     norm.update(torch.full((10, 1), 2.0))
     torch.testing.assert_close(norm(torch.tensor([[2.005]])), torch.tensor([[0.5]]), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("rewards", "returns"),
+    [
+        ((-1.0, 0.0), (-10.0, 0.0)),
+        ((0.0, 1.0), (0.0, 10.0)),
+        ((0.5, 1.0), (0.0, 10.0)),  # an episode may end at once
+        ((-math.inf, math.inf), (-math.inf, math.inf)),
+    ],
+)
+def test_the_returns_that_rewards_can_add_up_to(rewards, returns):
+    assert return_range(rewards, GAMMA) == pytest.approx(returns)
+
+
+def test_failure_costs_nothing_more_where_rewards_know_no_bound():
+    flag = torch.ones(1, 1, dtype=torch.bool)
+    steps = TensorDict(
+        {"next": {"reward": torch.full((1, 1), 3.0), "failure": flag, "terminated": flag}}, [1]
+    )
+    assert charge_failure(steps.clone(), GAMMA, (-math.inf, math.inf))["next", "reward"] == 3.0
+    assert charge_failure(steps.clone(), GAMMA, (0.0, 1.0))["next", "reward"] == 0.0
+
+
+def test_the_range_of_rewards_is_read_from_the_spec():
+    with_bounds, without = make_env("wam_wipe"), make_env("half_cheetah")
+    assert reward_range(with_bounds) == (-1.0, 0.0)
+    assert reward_range(without) == (-math.inf, math.inf)
