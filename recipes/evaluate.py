@@ -11,8 +11,8 @@ from pathlib import Path
 from torchrl.envs import TransformedEnv
 
 import nht
-from nht.recipes.config import DDPG, Evaluate
-from nht.recipes.environments import mapped_env
+from nht.recipes.config import Evaluate
+from nht.recipes.environments import lasting_failures, mapped_env
 from nht.recipes.evaluation import evaluate, record_video
 from nht.recipes.launch import launch
 from nht.recipes.networks import load_policy
@@ -22,10 +22,9 @@ from nht.recipes.run_folder import read_config
 def main(config: Evaluate) -> None:
     """Test, film, and say how it went."""
     folder = Path(config.run)
-    trained = read_config(folder, DDPG)
-    env = replace(
-        trained.env, options=trained.env.options | {"terminate_on_failure": False} | config.env_options
-    )
+    trained = read_config(folder)
+    env = lasting_failures(trained.env)
+    env = replace(env, options=env.options | config.env_options)
     map = nht.load_map(folder / "map.safetensors")
 
     def build(copies: int) -> TransformedEnv:

@@ -82,6 +82,8 @@ def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
     )
     charged = charge_failure(steps, GAMMA)["next", "reward"].squeeze(-1)
     assert lowest_return(GAMMA) == pytest.approx(-10.0)
+    assert lowest_return(GAMMA, steps=2) == pytest.approx(-1.9)
+    assert lowest_return(1.0, steps=200) == -200.0
     assert charged.tolist() == pytest.approx([-10.0, -1.0, -1.0, -1.0])
 
 
