@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nht.envs.registry import TASKS, make_task
 from nht.envs.rendering import SceneRenderer
 
-METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"]}
 
 
 class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -38,6 +38,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         # Gymnasium's rule: without a seed, every environment draws its own.
         options.setdefault("seed", int(self.np_random.integers(2**31)))
         self.task = make_task(task, num_envs=1, **options)
+        self.metadata = METADATA | {"render_fps": round(1 / self.task.time_per_step)}
         self.render_mode = render_mode
         low, high = (bound.astype(np.float32) for bound in self.task.actuation_bounds)
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
@@ -85,7 +86,13 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.task.close()
 
 
-GYMNASIUM_IDS = {"wam_wipe": "nht/WAMWipe-v0"}
+GYMNASIUM_IDS = {
+    "ant": "nht/Ant-v0",
+    "half_cheetah": "nht/HalfCheetah-v0",
+    "hopper": "nht/Hopper-v0",
+    "walker2d": "nht/Walker2d-v0",
+    "wam_wipe": "nht/WAMWipe-v0",
+}
 """Gymnasium's id of every task."""
 
 

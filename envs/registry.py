@@ -7,12 +7,20 @@ from typing import Any
 
 import torch
 
+from nht.envs.ant import Ant
 from nht.envs.experts import Expert, WipeExpert
+from nht.envs.locomotion import HalfCheetah, Hopper, Walker2d
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.task import BatchedTask
 from nht.envs.wam import WAMWipe
 
-TASKS: dict[str, type[BatchedTask]] = {"wam_wipe": WAMWipe}
+TASKS: dict[str, type[BatchedTask]] = {
+    "ant": Ant,
+    "half_cheetah": HalfCheetah,
+    "hopper": Hopper,
+    "walker2d": Walker2d,
+    "wam_wipe": WAMWipe,
+}
 """Every task by the name that recipes and ``make_env`` use."""
 
 EXPERTS: dict[str, type[Expert]] = {"wam_wipe": WipeExpert}

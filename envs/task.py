@@ -6,6 +6,7 @@ A task is the physics-facing half of an environment. It knows neither TorchRL no
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 ASSETS = Path(__file__).parent / "assets"
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,6 @@ class BatchedTask(ABC):
         ValueError: if a count is below 1.
     """
 
-    observation_sizes: ClassVar[dict[str, int]]
-    """Length of every observation by its key; ``"observation"`` is what a policy sees."""
-
     def __init__(
         self,
         model: mujoco.MjModel,
@@ -79,6 +78,8 @@ class BatchedTask(ABC):
         self.substeps = substeps
         self.max_episode_steps = max_episode_steps
         self.num_threads = num_threads
+        self.time_per_step: float = substeps * model.opt.timestep
+        """Simulated time of one environment step [s]."""
         self.seed(seed)
 
         full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -99,6 +100,11 @@ class BatchedTask(ABC):
         self.rng = np.random.default_rng(seed)
 
     # What a task adds.
+
+    @property
+    @abstractmethod
+    def observation_sizes(self) -> dict[str, int]:
+        """Length of every observation by its key; ``"observation"`` is what a policy sees."""
 
     @property
     @abstractmethod
@@ -175,18 +181,53 @@ class BatchedTask(ABC):
             self._control,
             control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
             skip_checks=True,
-            nstep=self.substeps,
+            nstep=self._control.shape[1],
             state=self._trajectory,
         )
-        after = self._trajectory[:, -1]
+        after = self._complete(self._trajectory[:, -1])
         # MuJoCo answers bad numbers by a reset of the simulation and then stands still: its clock falls behind.
         elapsed = after[:, 0] - self.state[:, 0]
-        expected = (self.substeps - 0.5) * self.model.opt.timestep
+        expected = (1 - 0.5 / self.substeps) * self.time_per_step
         diverged = ~(np.isfinite(after).all(axis=1) & (elapsed > expected))
         if diverged.any():
             after = np.where(diverged[:, None], self.state, after)
         self.state[:] = after
         return diverged
+
+    def _complete(self, after: Array) -> Array:
+        """Take the substeps that a task keeps from ``rollout``, none by default, from the state ``(N, ..)`` it left."""
+        return after
+
+    def set_state(
+        self, qpos: Array, qvel: Array, rows: NDArray[np.intp] | None = None, *, tolerance: float = 0.1
+    ) -> None:
+        """Put the copies ``rows`` (all by default) into states from outside; their episodes go on from there.
+
+        Args:
+            qpos: positions ``(len(rows), nq)`` in the model's order [m, rad].
+            qvel: velocities ``(len(rows), nv)`` [m/s, rad/s].
+            rows: indices of the copies.
+            tolerance: how far beyond its limits a joint may stand [m, rad]. MuJoCo's limits give way: strong motors
+                push a joint past them by some 0.5 rad.
+
+        Raises:
+            ValueError: for another shape, a number that is not finite or a joint beyond its limits. No copy is changed.
+            RuntimeError: if the task is closed.
+        """
+        self._check_open()
+        rows = np.arange(self.num_envs) if rows is None else rows
+        for name, given, size in (("qpos", qpos, self.model.nq), ("qvel", qvel, self.model.nv)):
+            if given.shape != (len(rows), size):
+                raise ValueError(f"expected {name} of shape {(len(rows), size)}, got {given.shape}.")
+            if not np.isfinite(given).all():
+                raise ValueError(
+                    f"{name} must be finite: row {np.argwhere(~np.isfinite(given))[0, 0]} is not."
+                )
+        _check_limits(self.model, qpos, tolerance)
+        saved = self.state_dict()
+        saved["state"][rows, 1:] = 0.0
+        saved["state"][rows, 1 : 1 + self.model.nq + self.model.nv] = np.concatenate([qpos, qvel], axis=1)
+        self.load_state_dict(saved)  # where a task also renews what it derives from the state
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a later ``load_state_dict`` needs to go on bit for bit: physics, episode and generator."""
@@ -219,3 +260,34 @@ class BatchedTask(ABC):
     def _check_open(self) -> None:
         if self.closed:
             raise RuntimeError("the environment is closed: make a new one.")
+
+
+def load_model(path: Path) -> mujoco.MjModel:
+    """Compile an MJCF file.
+
+    MuJoCo's warnings, which it would also write to a file in the working folder, go to this module's logger.
+
+    Raises:
+        ValueError: if it does not compile: the file's name, and MuJoCo's message.
+    """
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(LOGGER.info)
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ValueError(f"{path} does not compile: {error}") from error
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+def _check_limits(model: mujoco.MjModel, qpos: Array, tolerance: float) -> None:
+    limited = np.flatnonzero(model.jnt_limited)
+    angle = qpos[:, model.jnt_qposadr[limited]]
+    low, high = model.jnt_range[limited].T
+    beyond = np.maximum(low - angle, angle - high)
+    if beyond.size and beyond.max() > tolerance:
+        row, joint = np.unravel_index(beyond.argmax(), beyond.shape)
+        raise ValueError(
+            f"joint {model.joint(limited[joint]).name!r} stands at {angle[row, joint]:.4g} in row {row}, more than "
+            f"{tolerance} beyond its limits [{low[joint]:.4g}, {high[joint]:.4g}]."
+        )

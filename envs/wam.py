@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, BatchedTask, Flags
+from nht.envs.task import ASSETS, Array, BatchedTask, Flags, load_model
 from nht.envs.wam_kinematics import (
     JOINT_HIGH,
     JOINT_LOW,
@@ -94,7 +94,7 @@ class WAMWipe(BatchedTask):
         if not 0 <= swivel_range <= 1.5:
             raise ValueError(f"swivel_range must lie in [0, 1.5] rad, got {swivel_range}.")
         super().__init__(
-            mujoco.MjModel.from_xml_path(str(ASSETS / "wam_wipe.xml")),
+            load_model(ASSETS / "wam_wipe.xml"),
             num_envs=num_envs,
             substeps=10,
             max_episode_steps=max_episode_steps,

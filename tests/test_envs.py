@@ -17,11 +17,50 @@ from nht.envs import EXPERTS, GYMNASIUM_IDS, TASKS, make_env, make_expert
 
 FLAGS = ("done", "terminated", "truncated", "success", "failure", "diverged")
 
-# Observation entries that are the same in every state of every episode.
-CONSTANT = {"wam_wipe": {("observation", 12), ("goal", 2)}}  # the goal's height: it lies on the table
+# Observation entries that are the same in every state of every episode, or at least of these short ones.
+CONSTANT = {
+    # Six numbers for the contacts of each of 13 bodies: nothing but the feet touches the floor so soon.
+    "ant": {("observation", 27 + 6 * body + i) for body in set(range(13)) - {3, 6, 9, 12} for i in range(6)},
+    "wam_wipe": {("observation", 12), ("goal", 2)},  # the goal's height: it lies on the table
+}
 
 # Copy 0 of two, seed 0, after three steps of `random_actions`: what the policy sees, and the three rewards.
 GOLDEN = {
+    "ant": (
+        [
+            *(0.65713, 0.99116, -0.10578, 0.06288, -0.04951),  # height, quaternion
+            *(-0.56469, 0.75069, 0.1322, -1.27669, 0.41216, -1.10266, 0.40664, 1.1449),  # joint angles
+            *(-0.46151, -0.16499, -0.68016, -5.41923, -1.54286, -3.40337),  # torso velocity
+            *(1.45274, 1.19231, -2.52664, -1.52142, 9.96467, -7.93235, 1.4865, 9.55785),  # joint velocities
+            *([0.0] * 36 + [1.0, 1.0, 1.0, 1.0, -1.0, 1.0] + [0.0] * 36),  # contacts: a foot stands
+        ],
+        [-0.7661, -0.60847, -0.76477],
+    ),
+    "half_cheetah": (
+        [
+            *(-0.05313, 0.05963),  # height, pitch
+            *(0.1823, -0.24033, 0.26279, -0.03604, -0.01877, 0.07396),  # joint angles
+            *(1.48257, -0.75566, 0.36317),  # torso velocity
+            *(-2.60696, 8.57994, 12.86768, 17.54061, -8.50695, -5.15264),  # joint velocities
+        ],
+        [-0.52163, -0.18481, 0.89852],
+    ),
+    "hopper": (
+        [
+            *(1.2453, -0.00197, 0.00439, -0.00667, -0.01745),  # height, pitch, joint angles
+            *(-0.11047, -0.21808, -0.40762, 0.22424, -1.25707, -0.44562),  # velocities
+        ],
+        [0.97442, 0.97876, 0.94518],
+    ),
+    "walker2d": (
+        [
+            *(1.24252, -0.03694),  # height, pitch
+            *(0.03605, -0.14579, -0.03575, -0.0317, -0.00217, 0.24028),  # joint angles
+            *(-0.44379, -0.64819, -0.45814),  # torso velocity
+            *(5.81792, -10.0, 10.0, 0.3638, -0.87817, 10.0),  # joint velocities
+        ],
+        [0.83121, 0.5631, 0.56484],
+    ),
     "wam_wipe": (
         [
             *(-0.15767, 0.40263, 0.0544, 2.13132, -0.05915, 0.57357, -0.1523),  # joint angles
@@ -30,7 +69,7 @@ GOLDEN = {
             *(0.03401, -0.01453, -0.99932),  # face normal
         ],
         [-1.0, -1.0, -1.0],
-    )
+    ),
 }
 
 
