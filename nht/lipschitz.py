@@ -63,9 +63,7 @@ class LipschitzProjection:
         slopes = _slopes(self.network)
         per_layer = (map.lipschitz / map.network_gain) ** (1 / len(slopes)) * (1 - ROUNDING)
         self.limits = [per_layer / slope for slope in slopes]
-        self.directions: list[
-            Tensor
-        ] = []  # of each matrix, close to its leading right singular vector, a column
+        self.directions: list[Tensor] = []  # of each matrix, close to its leading right singular vector, a column
         self.exact()
 
     @torch.no_grad()

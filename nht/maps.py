@@ -196,9 +196,7 @@ class ContextNetwork(nn.Module):
         if context_dim < 1 or any(width < 1 for width in hidden):
             raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}")
         if heads > 1 and not hidden:
-            raise ValueError(
-                "several heads need a hidden layer that they can have of their own, got hidden=[]"
-            )
+            raise ValueError("several heads need a hidden layer that they can have of their own, got hidden=[]")
         self.activation = activation
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
