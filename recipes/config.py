@@ -83,6 +83,7 @@ class DDPGConfig(AlgoConfig):
     exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
     noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
     random_action: float = 0.1  # probability of a uniform action instead
+    clip_targets: bool = True  # to [-1 / (1 - gamma), 0], for rewards in [-1, 0]
     pessimism: float = 0.8  # the critic starts at -pessimism / (1 - gamma)
     observation_clip: float = 5.0  # of the normalised observation
 

@@ -35,7 +35,9 @@ def main(config: DDPG) -> None:
     features, actor, critic = ddpg_networks(run.env, algo)
     policy = TensorDictSequential(features, actor)
 
-    loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2)
+    loss = PaperDDPGLoss(
+        actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, clip_targets=algo.clip_targets
+    )
     target = SoftUpdate(loss, eps=algo.polyak)
     optimiser = torch.optim.Adam(
         [

@@ -24,13 +24,14 @@ class ClippedTD0Estimator(TD0Estimator):
 
 
 class PaperDDPGLoss(DDPGLoss):
-    """``DDPGLoss`` with both target networks, clipped targets, and an actor that pays for large actions.
+    """``DDPGLoss`` with both target networks, targets clipped if asked for, and an actor that pays for large actions.
 
     Args:
         actor_network: ``"features"`` to an ``"action"`` in [-1, 1]^k.
         value_network: features and action to a ``"state_action_value"``.
         gamma: discount factor.
         action_l2: weight of the mean squared action in the actor's loss.
+        clip_targets: whether rewards lie in [-1, 0], so that targets beyond what these add up to are errors.
     """
 
     def __init__(
@@ -40,10 +41,12 @@ class PaperDDPGLoss(DDPGLoss):
         *,
         gamma: float,
         action_l2: float,
+        clip_targets: bool = True,
     ) -> None:
         super().__init__(actor_network, value_network, delay_actor=True, delay_value=True)
         self.action_l2 = action_l2
-        estimator = ClippedTD0Estimator(gamma=gamma, value_network=self.actor_critic)
+        kind = ClippedTD0Estimator if clip_targets else TD0Estimator
+        estimator = kind(gamma=gamma, value_network=self.actor_critic)
         estimator.set_keys(value=self.tensor_keys.state_action_value)
         self.make_value_estimator(estimator)
 

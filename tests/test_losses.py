@@ -23,12 +23,12 @@ class Linear(nn.Module):
         return self.weight * torch.cat(inputs, -1).sum(-1, keepdim=True) + self.bias
 
 
-def loss(critic_bias=0.0, action_l2=0.0):
+def loss(critic_bias=0.0, action_l2=0.0, clip_targets=True):
     actor = TensorDictModule(Linear(0.5, 0.0), in_keys=["features"], out_keys=["action"])
     critic = TensorDictModule(
         Linear(1.0, critic_bias), in_keys=["features", "action"], out_keys=["state_action_value"]
     )
-    return PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=action_l2)
+    return PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=action_l2, clip_targets=clip_targets)
 
 
 def batch(features, action, next_features, reward, terminated=False):
@@ -56,6 +56,12 @@ def test_termination_stops_the_bootstrap_and_truncation_does_not():
 def test_targets_stay_within_the_returns_that_are_possible():
     assert loss(critic_bias=100.0)(batch(1.0, 0.5, 1.0, -1.0))["target_value"].item() == 0.0
     assert loss(critic_bias=-100.0)(batch(1.0, 0.5, 1.0, -1.0))["target_value"].item() == pytest.approx(-10.0)
+
+
+def test_targets_are_free_where_rewards_have_either_sign():
+    # next action = 0.5, next value = 1 + 0.5 + 100
+    module = loss(critic_bias=100.0, clip_targets=False)
+    assert module(batch(1.0, 0.5, 1.0, 2.0))["target_value"].item() == pytest.approx(2.0 + GAMMA * 101.5)
 
 
 def test_actor_pays_for_large_actions_and_leaves_the_critic_alone():

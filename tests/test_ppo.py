@@ -22,6 +22,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import nht
+import nht.envs
 from nht.recipes import ddpg, evaluate, ppo
 from nht.recipes.config import DDPG, PPO, Evaluate, PPOConfig
 from nht.recipes.environments import mapped_env
@@ -33,6 +34,7 @@ from nht.recipes.run_folder import RunFolder, read_config
 GAMMA, LAMBDA = 0.9, 0.8
 
 TINY = [
+    "env=wam_wipe",
     "map=none",
     "env.num_envs=4",
     "env.options.max_episode_steps=25",
@@ -345,6 +347,31 @@ def test_all_settings_of_the_papers_table_3_can_be_set():
             assert algo.frames_per_batch == steps_per_update
 
 
+@pytest.mark.parametrize("task", sorted({"half_cheetah", *nht.envs.TASKS}))
+def test_both_algorithms_run_on_every_task(task, tmp_path):
+    metrics = train(
+        tmp_path / "ppo", f"env={task}", "env.options.max_episode_steps=25", "algo.total_frames=256"
+    )
+    assert metrics[["loss_critic", "eval_return"]].notna().all(axis=None)
+    shared = [line for line in TINY if not re.match("algo.(epochs|minibatches|total)|env=", line)]
+    overrides = ["algo=ddpg_locomotion", "algo.updates_per_batch=3", "algo.warmup_frames=0"]
+    ddpg.main(
+        configure(
+            DDPG,
+            "ddpg",
+            [
+                *shared,
+                f"env={task}",
+                *overrides,
+                "algo.buffer_size=500",
+                "algo.total_frames=256",
+                f"run.folder={tmp_path / 'ddpg'}",
+            ],
+        )
+    )
+    assert pandas.read_csv(tmp_path / "ddpg" / "metrics.csv")["loss_value"].notna().all()
+
+
 # Bad input.
 
 
@@ -403,7 +430,7 @@ def test_a_map_for_another_observation_layout(tmp_path):
         "env.name=moon",
         "env.options.max_episode_steps=50",
         "algo.hidden=[32,32]",
-        "algo.activation=relu",
+        "algo.activation=tanh",
         "map.kind=svd",
         "evaluation.episodes=5",
     ],
