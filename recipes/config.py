@@ -73,11 +73,17 @@ class MapConfig:
 
 
 @dataclass
-class DDPGConfig:
-    """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
+class AlgoConfig:
+    """What every algorithm has: how many environment steps, and how many of them between two rounds of updates."""
 
     total_frames: int = 100_000
     frames_per_batch: int = 200
+
+
+@dataclass
+class DDPGConfig(AlgoConfig):
+    """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
+
     updates_per_batch: int = 20
     warmup_frames: int = 2_000  # collected before the first update
     batch_size: int = 256
@@ -110,6 +116,57 @@ class DDPGConfig:
                 raise ValueError(f"algo.{name} must not be negative, got {getattr(self, name)}.")
         if self.noise_memory < 1:
             raise ValueError(f"algo.noise_memory must be at least 1 step, got {self.noise_memory}.")
+
+
+@dataclass
+class PPOConfig(AlgoConfig):
+    """PPO's settings; those of OpenAI's ppo2, which the paper ran, are ``algo=ppo_paper``."""
+
+    total_frames: int = 1_003_520
+    frames_per_batch: int = 2_048  # steps per update, of all copies together
+    epochs: int = 10  # times that a batch is gone through
+    minibatches: int = 16  # gradient steps in an epoch
+    hidden: list[int] = field(default_factory=lambda: [256, 256])  # of the actor, and of the critic
+    activation: str = "relu"  # or tanh
+    initial_std: float = 0.135  # of the actions, of which the task sees those in [-1, 1]
+    learning_rate: float = 3e-4
+    decay_learning_rate: bool = True  # linearly, to 0 at total_frames
+    gamma: float = 0.98
+    lmbda: float = 0.92  # GAE's lambda
+    clip: float = 0.1  # of the ratio of probabilities
+    clip_value: bool = False  # holds the critic within clip of its old values, too
+    critic_coeff: float = 0.58  # weight of the critic's mean squared error
+    entropy_coeff: float = 4e-4
+    max_grad_norm: float = 0.8
+    observation_clip: float = 10.0  # of the normalised observation
+    reward_clip: float = 10.0  # of the reward over the deviation of discounted returns
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a value outside its range."""
+        for name in ("gamma", "lmbda"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"algo.{name} must lie in (0, 1], got {getattr(self, name)}.")
+        for name in ("total_frames", "frames_per_batch", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"algo.{name} must be at least 1, got {getattr(self, name)}.")
+        for name in ("learning_rate", "clip", "initial_std", "max_grad_norm", "reward_clip"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"algo.{name} must be positive, got {getattr(self, name)}.")
+        for name in ("critic_coeff", "entropy_coeff"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"algo.{name} must not be negative, got {getattr(self, name)}.")
+        if self.activation not in ("tanh", "relu"):
+            raise ValueError(f"algo.activation must be tanh or relu, got {self.activation!r}.")
+        if self.frames_per_batch % self.minibatches:
+            raise ValueError(
+                f"algo.frames_per_batch={self.frames_per_batch} must be a multiple of "
+                f"algo.minibatches={self.minibatches}: all minibatches are of one size."
+            )
+        if self.frames_per_batch == self.minibatches:
+            raise ValueError(
+                f"algo.minibatches={self.minibatches} must be less than algo.frames_per_batch: "
+                "advantages are normalised within a minibatch, which takes two steps at least."
+            )
 
 
 @dataclass
@@ -171,13 +228,13 @@ class TrainMap:
 
 
 @dataclass
-class DDPG:
-    """``python -m nht.recipes.ddpg``."""
+class Training:
+    """A run of an algorithm on a task, through an action map."""
 
     env: EnvConfig = field(default_factory=EnvConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
     map: MapConfig = field(default_factory=MapConfig)
-    algo: DDPGConfig = field(default_factory=DDPGConfig)
+    algo: AlgoConfig = field(default_factory=AlgoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
     seed: int = 0
@@ -198,6 +255,20 @@ class DDPG:
                 f"algo.frames_per_batch={self.algo.frames_per_batch} must be a multiple of "
                 f"env.num_envs={self.env.num_envs}: every copy makes the same number of steps."
             )
+
+
+@dataclass
+class DDPG(Training):
+    """``python -m nht.recipes.ddpg``."""
+
+    algo: DDPGConfig = field(default_factory=DDPGConfig)
+
+
+@dataclass
+class PPO(Training):
+    """``python -m nht.recipes.ppo``."""
+
+    algo: PPOConfig = field(default_factory=PPOConfig)
 
 
 @dataclass

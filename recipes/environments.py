@@ -10,7 +10,7 @@ from torchrl.envs import TransformedEnv
 
 import nht
 from nht.envs import FOREIGN, BatchedMujocoEnv, ForeignEnv, make_env
-from nht.recipes.config import DDPG, EnvConfig
+from nht.recipes.config import EnvConfig, Training
 from nht.recipes.train_map import load_kind, train_map
 from nht.transforms import ActionMapTransform
 
@@ -33,10 +33,18 @@ def mapped_env(
         seed: of the task's random draws.
         num_envs: number of copies, if another than the configuration's.
         device: where the tensors go.
+
+    Raises:
+        KeyError, ValueError: if the map does not fit the task: the keys or widths of its context, its actuation.
     """
     base = base_env(env, seed=seed, num_envs=num_envs, device=device)
     context_keys = env.context_keys if map.context_dim else None
-    return TransformedEnv(base, ActionMapTransform(map, context_keys, action_scale=action_scale))
+    mapped = TransformedEnv(base, ActionMapTransform(map, context_keys, action_scale=action_scale))
+    if context_keys and map.context_keys is not None and list(map.context_keys) != context_keys:
+        raise ValueError(
+            f"the map was trained on the observations {list(map.context_keys)}, env.context_keys are {context_keys}."
+        )
+    return mapped
 
 
 def base_env(
@@ -71,14 +79,14 @@ def lasting_failures(env: EnvConfig) -> EnvConfig:
     return replace(env, options=env.options | {"terminate_on_failure": False})
 
 
-def test_env(config: DDPG, map: nht.ActionMap, episodes: int) -> TransformedEnv:
+def test_env(config: Training, map: nht.ActionMap, episodes: int) -> TransformedEnv:
     """One copy for each test episode, on seeds of its own; failures do not end episodes, they last."""
     env = lasting_failures(config.env)
     scale, seed = config.map.action_scale, config.seed + TEST_SEED
     return mapped_env(env, map, scale, seed=seed, num_envs=episodes, device=config.device)
 
 
-def run_map(config: DDPG, folder: Path) -> nht.ActionMap:
+def run_map(config: Training, folder: Path) -> nht.ActionMap:
     """The run's action map, which the run's folder keeps: the given file, else one trained on demonstrations.
 
     Raw actuation of a given scale needs no demonstrations.

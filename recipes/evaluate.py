@@ -11,7 +11,7 @@ from pathlib import Path
 from torchrl.envs import TransformedEnv
 
 import nht
-from nht.recipes.config import DDPG, Evaluate
+from nht.recipes.config import Evaluate
 from nht.recipes.environments import lasting_failures, mapped_env
 from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
@@ -23,7 +23,7 @@ from nht.recipes.video import record_video
 def main(config: Evaluate) -> None:
     """Test, film, and say how it went."""
     folder = Path(config.run)
-    trained = read_config(folder, DDPG)
+    trained = read_config(folder)
     env = lasting_failures(trained.env)
     env = replace(env, options=env.options | config.env_options)
     map = nht.load_map(folder / "map.safetensors")

@@ -1,17 +1,17 @@
-"""What the paper's DDPG adds to TorchRL's loss."""
+"""What the recipes add to TorchRL's losses."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.objectives import DDPGLoss
-from torchrl.objectives.value import TD0Estimator
+from torchrl.objectives import ClipPPOLoss, DDPGLoss
+from torchrl.objectives.value import GAE, TD0Estimator
 
 Range = tuple[float, float]
 
@@ -34,7 +34,7 @@ class ClippedTD0Estimator(TD0Estimator):
 
 
 class PaperDDPGLoss(DDPGLoss):
-    """``DDPGLoss`` with both target networks, clipped targets, and an actor that pays for large actions.
+    """``DDPGLoss`` with both target networks, targets clipped if asked for, and an actor that pays for large actions.
 
     Args:
         actor_network: ``"features"`` to an ``"action"`` in [-1, 1]^k.
@@ -79,19 +79,108 @@ def reward_range(env: EnvBase) -> Range:
     return (low if low > -largest else -math.inf), (high if high < largest else math.inf)
 
 
-def return_range(reward_range: Range, gamma: float) -> Range:
-    """The lowest and the highest discounted return that such rewards can add up to: over no step, or for ever."""
+def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> Range:
+    """The lowest and the highest discounted return that such rewards can add up to, over no step to ``steps``."""
     low, high = reward_range
-    return min(low, 0.0) / (1.0 - gamma), max(high, 0.0) / (1.0 - gamma)
+    most = steps if gamma == 1.0 else (1.0 - gamma**steps) / (1.0 - gamma)
+    return min(low, 0.0) * most, max(high, 0.0) * most
 
 
 def charge_failure(
-    tensordict: TensorDictBase, gamma: float, reward_range: Range = (-1.0, 0.0)
+    tensordict: TensorDictBase, gamma: float, reward_range: Range = (-1.0, 0.0), steps: float = math.inf
 ) -> TensorDictBase:
     """Let an episode that failure ended be worth the lowest return, where there is one: failing early never pays."""
-    lowest, _ = return_range(reward_range, gamma)
+    lowest, _ = return_range(reward_range, gamma, steps)
     if math.isfinite(lowest):
         outcome = tensordict["next"]
         fatal = outcome["failure"] & outcome["terminated"]
         outcome["reward"] = torch.where(fatal, lowest, outcome["reward"])
     return tensordict
+
+
+class GaussianPPOLoss(ClipPPOLoss):
+    """``ClipPPOLoss`` of a Gaussian actor: the same numbers, in less than half the time.
+
+    With networks as small as PPO's, TorchRL's loss spends most of its time on looking up keys, swapping parameters
+    and building distributions. This one calls the networks and writes the formulas out. Advantages are normalised
+    within the minibatch.
+
+    Args:
+        actor: its module is a ``GaussianActor``.
+        critic: ``"features"`` to a ``"state_value"``.
+        clip: how far the ratio of probabilities may move from 1.
+        clip_value: whether the critic is held within ``clip`` of its old values, too.
+        critic_coeff: weight of the critic's mean squared error.
+        entropy_coeff: weight of the entropy.
+    """
+
+    reports: ClassVar[tuple[str, ...]] = (
+        "loss_objective",
+        "loss_critic",
+        "entropy",
+        "clip_fraction",
+        "kl_approx",
+    )
+
+    def __init__(
+        self,
+        actor: TensorDictModule,
+        critic: TensorDictModule,
+        *,
+        clip: float,
+        clip_value: bool,
+        critic_coeff: float,
+        entropy_coeff: float,
+    ) -> None:
+        super().__init__(
+            actor,
+            critic,
+            clip_epsilon=clip,
+            clip_value=clip_value,
+            critic_coeff=critic_coeff,
+            entropy_coeff=entropy_coeff,
+            normalize_advantage=True,
+            loss_critic_type="l2",
+            functional=False,
+        )
+        self._clip, self._clips_value = clip, clip_value
+        self._critic_weight, self._entropy_weight = critic_coeff, entropy_coeff
+
+    def forward(self, batch: TensorDictBase) -> TensorDictBase:
+        """The ``"loss"`` to descend on, a scalar, and the ``reports``, detached, for minibatch ``(B,)``."""
+        features = batch["features"]
+        log_prob, entropy = self.actor_network.module.log_prob(features, batch["sample"])
+        log_ratio = log_prob - batch["sample_log_prob"]
+        ratio = log_ratio.exp()
+        clipped = ratio.clamp(1.0 - self._clip, 1.0 + self._clip)
+        advantage = batch["advantage"].squeeze(-1)
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+        objective = -torch.minimum(ratio * advantage, clipped * advantage).mean()
+        critic = self._critic_weight * self._squared_error(self.critic_network.module(features), batch)
+        loss = objective + critic - self._entropy_weight * entropy
+        with torch.no_grad():
+            reports = (objective, critic, entropy, (clipped != ratio).float().mean(), -log_ratio.mean())
+        return TensorDict({"loss": loss} | dict(zip(self.reports, reports, strict=True)))
+
+    def _squared_error(self, value: Tensor, batch: TensorDictBase) -> Tensor:
+        target = batch["value_target"]
+        error = (value - target).square()
+        if self._clips_value:
+            old = batch["state_value"]
+            held = old + (value - old).clamp(-self._clip, self._clip)
+            error = torch.maximum(error, (held - target).square())
+        return error.mean()
+
+
+@torch.no_grad()
+def estimate_advantages(
+    data: TensorDictBase, features: TensorDictModule, critic: TensorDictModule, gae: GAE
+) -> None:
+    """Write ``"state_value"``, ``"advantage"`` and ``"value_target"`` into collected steps ``(copies, steps)``.
+
+    What follows a step is valued by the observation that it led to: where an episode ran into its time limit, that is
+    its own last one, not the first of the next episode. Only ``terminated`` makes it worth nothing.
+    """
+    features(data["next"])
+    critic(data), critic(data["next"])
+    gae(data)

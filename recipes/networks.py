@@ -7,12 +7,14 @@ from pathlib import Path
 
 import torch
 from safetensors.torch import load_file, save_file
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
 
-from nht.recipes.config import DDPGConfig
+from nht.recipes.config import AlgoConfig, DDPGConfig, PPOConfig
 from nht.recipes.losses import return_range, reward_range
 
 
@@ -60,6 +62,107 @@ class RunningNorm(nn.Module):
         return ((observation - self.shift) / self.scale).clamp(-self.clip, self.clip)
 
 
+class ReturnNorm(nn.Module):
+    """Divides rewards by the deviation of the discounted returns so far, and clips, as OpenAI's baselines do.
+
+    Args:
+        num_envs: number of copies of the environment.
+        gamma: discount factor.
+        clip: largest absolute reward put out.
+    """
+
+    returns: Tensor
+
+    def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:
+        super().__init__()
+        self.gamma, self.clip = gamma, clip
+        self.statistics = RunningNorm(1, floor=1e-4)
+        self.register_buffer(
+            "returns", torch.zeros(num_envs)
+        )  # of the rewards up to now, of each copy's episode
+
+    @torch.no_grad()
+    def forward(self, data: TensorDictBase) -> TensorDictBase:
+        """Take the rewards of ``(num_envs, steps)`` into the statistics, then normalise them in place."""
+        outcome = data["next"]
+        reward, going_on = outcome["reward"].squeeze(-1), ~outcome["done"].squeeze(-1)
+        returns = torch.empty_like(reward)
+        for step in range(reward.shape[-1]):
+            returns[:, step] = self.gamma * self.returns + reward[:, step]
+            torch.mul(returns[:, step], going_on[:, step], out=self.returns)
+        self.statistics.update(returns.unsqueeze(-1))
+        outcome["reward"] = (outcome["reward"] / self.statistics.scale).clamp(-self.clip, self.clip)
+        return data
+
+
+class GaussianActor(nn.Module):
+    """Features to a Gaussian action whose deviation does not depend on them.
+
+    Samples are not bounded; the environment gets them clipped to [-1, 1].
+
+    Args:
+        network: features ``(*batch, size)`` to the mean ``(*batch, action_dim)``.
+        action_dim: number of actions k.
+        initial_std: deviation to start from.
+    """
+
+    def __init__(self, network: nn.Module, action_dim: int, initial_std: float) -> None:
+        super().__init__()
+        self.network = network
+        self.log_std = nn.Parameter(torch.full((action_dim,), math.log(initial_std)))
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Sample ``(*batch, k)``, its log-probability ``(*batch,)``, and the action ``(*batch, k)``."""
+        mean = self.network(features)
+        deviates = torch.zeros_like(mean)
+        if exploration_type() is not ExplorationType.DETERMINISTIC:
+            deviates.normal_()
+        sample = mean + deviates * self.log_std.exp()
+        return sample, self._log_density(deviates), sample.clamp(-1.0, 1.0)
+
+    def log_prob(self, features: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
+        """Log-probability of samples, ``(*batch,)``, and the entropy, a scalar."""
+        deviates = (sample - self.network(features)) * (-self.log_std).exp()
+        entropy = self.log_std.sum() + 0.5 * len(self.log_std) * math.log(2 * math.pi * math.e)
+        return self._log_density(deviates), entropy
+
+    def _log_density(self, deviates: Tensor) -> Tensor:
+        constant = 0.5 * len(self.log_std) * math.log(2 * math.pi)
+        return -0.5 * deviates.square().sum(-1) - self.log_std.sum() - constant
+
+
+def ppo_networks(
+    env: EnvBase, algo: PPOConfig
+) -> tuple[TensorDictModule, TensorDictModule, TensorDictModule]:
+    """Normaliser, actor and critic for ``env``, separate networks with orthogonal weights as ppo2 starts them.
+
+    Returns:
+        the normaliser, ``"observation"`` to ``"features"``; the actor, features to a ``"sample"``, its
+        ``"sample_log_prob"`` and an ``"action"`` in [-1, 1]^k; and the critic, features to a ``"state_value"``.
+    """
+    size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+    norm = RunningNorm(size, algo.observation_clip).to(env.device)
+    activation = {"tanh": nn.Tanh, "relu": nn.ReLU}[algo.activation]
+    hidden = {"num_cells": list(algo.hidden), "activation_class": activation}
+    mean = orthogonal(MLP(size, action_dim, **hidden), last_gain=0.01)
+    actor = GaussianActor(mean, action_dim, algo.initial_std).to(env.device)
+    critic = orthogonal(MLP(size, 1, **hidden), last_gain=1.0).to(env.device)
+    return (
+        TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
+        TensorDictModule(actor, in_keys=["features"], out_keys=["sample", "sample_log_prob", "action"]),
+        TensorDictModule(critic, in_keys=["features"], out_keys=["state_value"]),
+    )
+
+
+def orthogonal(network: MLP, last_gain: float) -> MLP:
+    """Orthogonal weights of gain sqrt(2), of another gain in the last layer, and biases of 0."""
+    layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+    for layer in layers:
+        nn.init.orthogonal_(layer.weight, last_gain if layer is layers[-1] else math.sqrt(2))
+        nn.init.zeros_(layer.bias)
+    return network
+
+
 def ddpg_networks(
     env: EnvBase, algo: DDPGConfig
 ) -> tuple[TensorDictModule, TensorDictModule, TensorDictModule]:
@@ -104,14 +207,21 @@ def save_policy(policy: nn.Module, folder: Path) -> None:
     save_file(policy.state_dict(), folder / "policy.safetensors")
 
 
-def load_policy(folder: Path, env: EnvBase, algo: DDPGConfig) -> TensorDictSequential:
+def load_policy(folder: Path, env: EnvBase, algo: AlgoConfig) -> TensorDictSequential:
     """The policy of a finished run, for an environment like the run's.
 
     Raises:
         FileNotFoundError: if the run has not finished.
         RuntimeError: if the policy does not fit the environment.
+        TypeError: if the algorithm is none of ours.
     """
-    features, actor, _ = ddpg_networks(env, algo)
+    match algo:
+        case DDPGConfig():
+            features, actor, _ = ddpg_networks(env, algo)
+        case PPOConfig():
+            features, actor, _ = ppo_networks(env, algo)
+        case _:
+            raise TypeError(f"no networks for {type(algo).__name__}.")
     policy = TensorDictSequential(features, actor)
     policy.load_state_dict(load_file(folder / "policy.safetensors"))
     return policy

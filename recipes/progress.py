@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -49,9 +50,11 @@ class TrainingStatistics:
 
     Args:
         bounds: the actuation's space in the environment, which clips at its ``low`` and ``high``, ``(*batch, n)``.
+        losses: names under which an update reports.
     """
 
-    def __init__(self, bounds: ContinuousBox) -> None:
+    def __init__(self, bounds: ContinuousBox, losses: Sequence[str] = ()) -> None:
+        self._losses = tuple(losses)
         self._low, self._high = (bound.reshape(-1, bound.shape[-1])[0] for bound in (bounds.low, bounds.high))
         self._clear()
 
@@ -62,8 +65,8 @@ class TrainingStatistics:
     def add_losses(self, losses: TensorDictBase) -> None:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
         self._updates += 1
-        for name, value in losses.items():
-            self._sums[name] = self._sums[name] + value.detach()
+        for name in self._losses:
+            self._sums[name] = self._sums[name] + losses[name].detach()
 
     def add_steps(self, steps: TensorDictBase) -> None:
         """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations."""
@@ -94,8 +97,7 @@ class TrainingStatistics:
             "diverged": self._sums["diverged"],  # a count: each one is a failure of map, policy or physics
             "clipped": self._sums["clipped"]
             / (self._steps or float("nan")),  # steps with a motor at its limit
-            "loss_actor": float(self._sums["loss_actor"]) / updates,
-            "loss_value": float(self._sums["loss_value"]) / updates,
         }
+        row |= {name: self._sums[name] / updates for name in self._losses}
         self._clear()
         return {name: float(value) for name, value in row.items()}

@@ -17,7 +17,7 @@ import pandas
 from numpy.typing import NDArray
 from scipy import stats
 
-from nht.recipes.config import DDPG, Report
+from nht.recipes.config import Report
 from nht.recipes.launch import launch
 from nht.recipes.run_folder import read_config
 
@@ -51,7 +51,7 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
 
 
 def _read_run(metrics: Path) -> pandas.DataFrame:
-    config = read_config(metrics.parent, DDPG)
+    config = read_config(metrics.parent)
     rows = pandas.read_csv(metrics)
     interface = "raw" if config.map.kind == "none" else config.map.kind
     rows.insert(0, "interface", interface)

@@ -8,7 +8,7 @@ import time
 from dataclasses import asdict
 from netrc import NetrcParseError, netrc
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, NoReturn, cast
 
 import pandas
 import wandb
@@ -17,9 +17,24 @@ from omegaconf import OmegaConf
 from torchrl.record.loggers.wandb import WandbLogger
 from tqdm import tqdm
 
-from nht.recipes.config import RunConfig
+from nht.recipes.config import DDPG, PPO, RunConfig, Training
 
-Config = TypeVar("Config")
+RECIPES: dict[str, type[Training]] = {"DDPG": DDPG, "PPO": PPO}
+"""What ``config.yaml`` says of the algorithm, under ``recipe``; folders that say nothing hold DDPG."""
+
+LASTING = (
+    "recipe",
+    "env.name",
+    "env.context_keys",
+    "env.num_envs",
+    "env.options",
+    "map.kind",
+    "map.action_dim",
+    "algo.hidden",
+    "algo.activation",
+    "evaluation.episodes",
+)
+"""Settings that a checkpoint was made for: resuming cannot change them."""
 
 
 class RunFolder:
@@ -32,6 +47,7 @@ class RunFolder:
     Raises:
         FileExistsError: if the folder holds a run already and ``run.resume`` is not set.
         FileNotFoundError: if ``run.resume`` is set and there is nothing to resume.
+        ValueError: if what is to be resumed is a run of another task, algorithm or network.
     """
 
     def __init__(self, run: RunConfig, config: Any) -> None:
@@ -46,9 +62,20 @@ class RunFolder:
                 f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
             )
         self.path.mkdir(parents=True, exist_ok=True)
-        if not run.resume:
-            settings.write_text(yaml.safe_dump(asdict(config), sort_keys=False))
+        described = {"recipe": type(config).__name__, **asdict(config)}
+        if run.resume:
+            self._check_same(yaml.safe_load(settings.read_text()), described)
+        else:
+            settings.write_text(yaml.safe_dump(described, sort_keys=False))
         self._wandb = self._start_wandb(run, config) if run.wandb else None
+
+    def _check_same(self, saved: dict[str, Any], described: dict[str, Any]) -> None:
+        for name in LASTING:
+            old, new = (_setting(settings, name) for settings in ({"recipe": "DDPG"} | saved, described))
+            if old != new:
+                raise ValueError(
+                    f"{self.path} holds a run with {name}={old}: it cannot go on with {name}={new}."
+                )
 
     def _start_wandb(self, run: RunConfig, config: Any) -> WandbLogger:
         os.environ.setdefault("WANDB_SILENT", "true")
@@ -98,7 +125,7 @@ class RunFolder:
         print(f"\n{self.path}: " + ", ".join(sorted(entry.name for entry in self.path.iterdir())))
 
 
-def read_config(folder: Path, schema: type[Config]) -> Config:
+def read_config(folder: Path) -> Training:
     """The configuration that a run was started with.
 
     Raises:
@@ -107,8 +134,17 @@ def read_config(folder: Path, schema: type[Config]) -> Config:
     settings = folder / "config.yaml"
     if not settings.exists():
         raise FileNotFoundError(f"{folder} holds no run: it has no config.yaml.")
-    merged = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.load(settings))
-    return cast(Config, OmegaConf.to_object(merged))
+    saved = yaml.safe_load(settings.read_text())
+    schema = OmegaConf.structured(RECIPES[saved.pop("recipe", "DDPG")])
+    return cast(Training, OmegaConf.to_object(OmegaConf.merge(schema, saved)))
+
+
+def _setting(settings: dict[str, Any], name: str) -> Any:
+    """The entry at a dotted name; None where there is none."""
+    node: Any = settings
+    for part in name.split("."):
+        node = node.get(part) if isinstance(node, dict) else None
+    return node
 
 
 def _logged_in() -> bool:

@@ -26,12 +26,12 @@ class Linear(nn.Module):
         return self.weight * torch.cat(inputs, -1).sum(-1, keepdim=True) + self.bias
 
 
-def loss(critic_bias=0.0, action_l2=0.0):
+def loss(critic_bias=0.0, action_l2=0.0, reward_range=(-1.0, 0.0)):
     actor = TensorDictModule(Linear(0.5, 0.0), in_keys=["features"], out_keys=["action"])
     critic = TensorDictModule(
         Linear(1.0, critic_bias), in_keys=["features", "action"], out_keys=["state_action_value"]
     )
-    return PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=action_l2)
+    return PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=action_l2, reward_range=reward_range)
 
 
 def batch(features, action, next_features, reward, terminated=False):
@@ -61,6 +61,12 @@ def test_targets_stay_within_the_returns_that_are_possible():
     assert loss(critic_bias=-100.0)(batch(1.0, 0.5, 1.0, -1.0))["target_value"].item() == pytest.approx(-10.0)
 
 
+def test_targets_are_free_where_rewards_know_no_bound():
+    # next action = 0.5, next value = 1 + 0.5 + 100
+    module = loss(critic_bias=100.0, reward_range=(-math.inf, math.inf))
+    assert module(batch(1.0, 0.5, 1.0, 2.0))["target_value"].item() == pytest.approx(2.0 + GAMMA * 101.5)
+
+
 def test_actor_pays_for_large_actions_and_leaves_the_critic_alone():
     # action = 0.5 * 2 = 1, value = 2 + 1 = 3
     module = loss(action_l2=0.25)
@@ -85,6 +91,8 @@ def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
     )
     charged = charge_failure(steps, GAMMA)["next", "reward"].squeeze(-1)
     assert return_range((-1.0, 0.0), GAMMA) == pytest.approx((-10.0, 0.0))
+    assert return_range((-1.0, 0.0), GAMMA, steps=2) == pytest.approx((-1.9, 0.0))
+    assert return_range((-1.0, 2.0), 1.0, steps=200) == (-200.0, 400.0)
     assert charged.tolist() == pytest.approx([-10.0, -1.0, -1.0, -1.0])
 
 

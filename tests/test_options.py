@@ -35,8 +35,10 @@ def test_an_unread_option_is_noticed():
 
 def unread_options(recipes: list[ast.Module], schema: ast.Module) -> list[str]:
     """Fields ("Class.field") of the dataclasses in `schema` that no recipe reads, by annotations."""
-    fields = {node.name: fields_of(node) for node in schema.body if isinstance(node, ast.ClassDef)}
-    reads = OptionReads(fields)
+    classes = {node.name: node for node in schema.body if isinstance(node, ast.ClassDef)}
+    fields = {name: fields_of(node) for name, node in classes.items()}
+    parents = {name: [ast.unparse(base) for base in node.bases] for name, node in classes.items()}
+    reads = OptionReads(fields, parents)
     for tree in recipes:
         reads.learn_functions(tree)
     for tree in recipes:
@@ -54,8 +56,10 @@ def fields_of(node: ast.ClassDef) -> dict[str, ast.expr]:
 class OptionReads(ast.NodeVisitor):
     """Collects (class, field) for each `x.field` where annotations tell that x is a configuration."""
 
-    def __init__(self, fields: dict[str, dict[str, ast.expr]]) -> None:
-        self.fields = fields
+    def __init__(
+        self, fields: dict[str, dict[str, ast.expr]], parents: dict[str, list[str]] | None = None
+    ) -> None:
+        self.fields, self.parents = fields, parents or {}
         self.returns: dict[str, str] = {}
         self.variables: dict[str, str] = {}
         self.found: set[tuple[str, str]] = set()
@@ -70,11 +74,17 @@ class OptionReads(ast.NodeVisitor):
         names = re.findall(r"\w+", ast.unparse(annotation)) if annotation else []
         return next((name for name in names if name in self.fields), None)
 
+    def declarer(self, owner: str, name: str) -> str:
+        """The class that declares a field: the owner itself, or one that it inherits from."""
+        inherited = [self.declarer(parent, name) for parent in self.parents.get(owner, [])]
+        found = [kind for kind in [owner, *inherited] if name in self.fields.get(kind, {})]
+        return found[0] if found else owner
+
     def type_of(self, node: ast.expr) -> str | None:
         if isinstance(node, ast.Name):
             return self.variables.get(node.id)
         if isinstance(node, ast.Attribute) and (owner := self.type_of(node.value)):
-            return self.config_in(self.fields[owner].get(node.attr))
+            return self.config_in(self.fields[self.declarer(owner, node.attr)].get(node.attr))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             return node.func.id if node.func.id in self.fields else self.returns.get(node.func.id)
         return None
@@ -101,7 +111,7 @@ class OptionReads(ast.NodeVisitor):
     def visit_Attribute(self, node: ast.Attribute) -> None:
         self.generic_visit(node)
         if isinstance(node.ctx, ast.Load) and (owner := self.type_of(node.value)):
-            self.found.add((owner, node.attr))
+            self.found.add((self.declarer(owner, node.attr), node.attr))
 
     def visit_keyword(self, node: ast.keyword) -> None:
         """`f(**asdict(x))` reads all of x."""

@@ -39,7 +39,7 @@ def test_outcomes_are_means_over_the_episodes_that_ended() -> None:
 
 
 def test_a_loss_that_is_no_number_ends_the_training() -> None:
-    statistics = TrainingStatistics(BOUNDS)
+    statistics = TrainingStatistics(BOUNDS, losses=["loss_actor"])
     statistics.add_losses(TensorDict({"loss_actor": torch.tensor(torch.nan)}))
     with pytest.raises(FloatingPointError, match="loss_actor is nan: training diverged"):
         statistics.take()
