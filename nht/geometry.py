@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-# On the CPU, not compiled, from so many reflectors on and up to so large a batch, all reflections at once are 1.2 to 2
-# times as fast as one by one, for k calls take longer than their arithmetic. Elsewhere one by one is the fastest of
-# all, or within a tenth of it: benchmarks/householder.py.
+# On the CPU, not compiled, from so many reflectors on and up to so large a batch, all reflections at once are 1.2 to
+# 1.8 times as fast as one by one, for k calls take longer than their arithmetic. Elsewhere one by one is the fastest
+# of all that are exact to 1e-6, up to 10 times ahead: benchmarks/householder.py.
 MANY_REFLECTORS, SMALL_BATCH = 12, 8
 
 
@@ -69,7 +69,7 @@ def _calls_outweigh_arithmetic(reflectors: Tensor) -> bool:
 def _reflect_at_once(reflectors: Tensor, vector: Tensor) -> Tensor:
     """Compact WY form: H(v_1) ... H(v_k) = I - 2 V^T T V, row i of V being v_i, with T^-1 = I + 2 striu(V V^T).
 
-    In double precision, for T magnifies the roundings of V V^T: up to 5e-6 in single. So half precision works too.
+    In double precision, for T magnifies the roundings of V V^T: beyond 1e-6 in single. So half precision works too.
     """
     rows, row = reflectors.double(), vector.double().unsqueeze(-2)
     doubled = 2 * rows
