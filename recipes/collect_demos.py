@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import nht
 from nht.envs import make_env
 from nht.envs.registry import TASKS
-from nht.recipes.config import DDPG, CollectDemos, DemosConfig, EnvConfig, SourceConfig
+from nht.recipes.config import CollectDemos, DemosConfig, EnvConfig, SourceConfig
 from nht.recipes.demo_files import FILES, best_episodes, read_episodes
 from nht.recipes.environments import mapped_env
 from nht.recipes.launch import launch
@@ -67,7 +67,7 @@ def record_policy(
     if run is None:
         raise ValueError("source=policy needs source.path: the folder of a finished run.")
     folder = Path(run)
-    trained = read_config(folder, DDPG)
+    trained = read_config(folder)
     if trained.env.name != env.name:
         raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
     options = trained.env.options | endings(env.name)

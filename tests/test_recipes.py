@@ -147,7 +147,7 @@ def test_wandb_works_offline_and_gets_video_and_map(map_file, tmp_path, monkeypa
     train(tmp_path / "run", map_file, *overrides, "env.options.max_episode_steps=10")
     assert list((tmp_path / "run").rglob("*.wandb"))
     frames = iio.imread(tmp_path / "run" / "video.mp4")
-    assert frames.shape[0] == 10
+    assert frames.shape[0] == 6  # the start and every second of 10 steps
     assert frames.std() > 10  # something is in the picture
 
 
@@ -162,7 +162,7 @@ def test_evaluate_repeats_itself_and_films(run, tmp_path, capsys):
     assert capsys.readouterr().out == first
     assert "eval_success" in first
     evaluate.main(replace(config, video=True, video_episodes=2, env_options={"max_episode_steps": 5}))
-    assert iio.imread(copied / "evaluation.mp4").shape[:1] == (5,)
+    assert len(iio.imread(copied / "evaluation.mp4")) == 4  # the start, every second of 5 steps, and the end
 
 
 def test_report_compares_the_runs_below_a_folder(run, map_file, tmp_path):
