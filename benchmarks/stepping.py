@@ -174,7 +174,7 @@ def main() -> None:
     )
     parser.add_argument("--tasks", nargs="+", choices=sorted(TASKS), default=sorted(TASKS))
     parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--env-steps", type=int, default=2048, help="of every method in a round")
+    parser.add_argument("--env-steps", type=int, default=4096, help="of every method in a round")
     parser.add_argument("--envpool", help="a Python that has envpool, to measure its HalfCheetah too")
     options = parser.parse_args()
     torch.set_num_threads(1)
