@@ -131,7 +131,7 @@ class WAMGrasp(BatchedTask):
         self.failed |= clearance(self._arm, self.qpos) < 0
         success = self._at_goal() & ~self.failed
         ended = (self.failed & self.terminate_on_failure) | (success & self.terminate_on_success)
-        return success - 1.0, ended, success, self.failed.copy()
+        return success.astype(np.float64) - 1.0, ended, success, self.failed.copy()
 
     def _at_goal(self) -> Flags:
         to_goal = self.goal - self._position
