@@ -62,6 +62,7 @@ class WAMGrasp(BatchedTask):
         "goal": 3,
     }
     _episode_arrays = ("goal", "failed")
+    reward_range = (-1.0, 0.0)
 
     def __init__(
         self,
