@@ -99,7 +99,7 @@ def charge_failure(
 
 
 class GaussianPPOLoss(ClipPPOLoss):
-    """``ClipPPOLoss`` of a Gaussian actor: the same numbers, in less than half the time.
+    """``ClipPPOLoss`` of a Gaussian actor: the same numbers in less time.
 
     With networks as small as PPO's, TorchRL's loss spends most of its time on looking up keys, swapping parameters
     and building distributions. This one calls the networks and writes the formulas out. Advantages are normalised
@@ -147,7 +147,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         self._critic_weight, self._entropy_weight = critic_coeff, entropy_coeff
 
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
-        """The ``"loss"`` to descend on, a scalar, and the ``reports``, detached, for minibatch ``(B,)``."""
+        """The ``"loss"`` to descend on, a scalar, and the ``reports``, for a minibatch ``(B,)``."""
         features = batch["features"]
         log_prob, entropy = self.actor_network.module.log_prob(features, batch["sample"])
         log_ratio = log_prob - batch["sample_log_prob"]

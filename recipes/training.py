@@ -38,7 +38,7 @@ class TrainingRun:
     def __init__(self, config: Training, losses: Sequence[str]) -> None:
         torch.set_num_threads(config.torch_threads)
         torch.manual_seed(config.seed)
-        self._config, self._losses = config, losses
+        self._config = config
         self._folder = RunFolder(config.run, config)
         self._map = run_map(config, self._folder.path)
         self.env = mapped_env(
