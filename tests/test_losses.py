@@ -135,7 +135,9 @@ def test_failure_costs_nothing_more_where_rewards_know_no_bound():
     assert charge_failure(steps.clone(), GAMMA, (0.0, 1.0))["next", "reward"] == 0.0
 
 
-def test_the_range_of_rewards_is_read_from_the_spec():
-    with_bounds, without = make_env("wam_wipe"), make_env("half_cheetah")
-    assert reward_range(with_bounds) == (-1.0, 0.0)
-    assert reward_range(without) == (-math.inf, math.inf)
+@pytest.mark.parametrize(
+    ("task", "rewards"),
+    [("wam_wipe", (-1.0, 0.0)), ("wam_grasp", (-1.0, 0.0)), ("half_cheetah", (-math.inf, math.inf))],
+)
+def test_the_range_of_rewards_is_read_from_the_spec(task, rewards):
+    assert reward_range(make_env(task)) == rewards
