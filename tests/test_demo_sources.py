@@ -289,7 +289,7 @@ def test_a_policys_demonstrations_are_what_the_motors_got(run, tmp_path):
     assert demos.manifest["settings"]["left_out_episodes"] > 0
     last = torch.cat([demos.episode[1:] != demos.episode[:-1], torch.ones(1, dtype=torch.bool)])
     assert demos.data["success"].squeeze(-1).equal(last)
-    trained = read_config(run, DDPG)
+    trained = read_config(run)
     map = nht.load_map(run / "map.safetensors")
     env = mapped_env(trained.env, map, trained.map.action_scale, seed=0, num_envs=1)
     action = load_policy(run, env, trained.algo)(demos.data.select("observation").to_tensordict())["action"]
