@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, BatchedTask, Flags
+from nht.envs.task import ASSETS, Array, BatchedTask, Flags, load_model
 from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, brake
 from nht.envs.wam_collision import ArmGeoms
 from nht.envs.wam_kinematics import MAX_SPEED, damped_solve, forward_kinematics, tool_pose
@@ -181,7 +181,7 @@ def _add_geom(
 
 def grasp_model() -> mujoco.MjModel:
     """The arm, the table and the object."""
-    return mujoco.MjModel.from_xml_path(str(ASSETS / "wam_grasp.xml"))
+    return load_model(ASSETS / "wam_grasp.xml")
 
 
 def clearance(arm: ArmGeoms, joint_angle: Array) -> Array:
