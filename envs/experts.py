@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from nht.envs.task import Array
-from nht.envs.wam import DOWN, TABLE_HEIGHT
 from nht.envs.wam_grasp import GRASP_RADIUS, OBJECT_CENTRE
 from nht.envs.wam_kinematics import damped_solve, forward_kinematics
+from nht.envs.wam_wipe import DOWN, TABLE_HEIGHT
 
 
 class Expert(ABC):

@@ -18,8 +18,8 @@ from nht.envs.locomotion import HalfCheetah, Hopper, Walker2d
 from nht.envs.manipulator import BringBall
 from nht.envs.mujoco_batch import BatchedMujocoEnv
 from nht.envs.task import BatchedTask
-from nht.envs.wam import WAMWipe
 from nht.envs.wam_grasp import WAMGrasp
+from nht.envs.wam_wipe import WAMWipe
 
 TASKS: dict[str, type[BatchedTask]] = {
     "ant": Ant,

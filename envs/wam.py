@@ -1,147 +1,87 @@
-"""Tasks of the Barrett WAM arm, kinematic as in the paper (section A.1): the actuation sets the joint velocities."""
+"""The Barrett WAM arm, kinematic as in the paper (section A.1): the actuation sets the joint velocities."""
 
 from __future__ import annotations
 
-import math
-from typing import Any, ClassVar, Literal, get_args
+from abc import abstractmethod
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, BatchedTask, Flags, load_model
-from nht.envs.wam_kinematics import (
-    JOINT_HIGH,
-    JOINT_LOW,
-    MAX_SPEED,
-    damped_solve,
-    forward_kinematics,
-    tool_pose,
-)
+from nht.envs.task import Array, BatchedTask, Flags
+from nht.envs.wam_kinematics import JOINT_HIGH, JOINT_LOW, MAX_SPEED, tool_pose
 
-START_POSTURE = np.array([-0.2024, 0.4339, 0.0471, 2.1786, -0.0392, 0.5299, -0.1258])
-"""The authors' start posture [rad]: the tool face lies flush on the table."""
-TABLE_HEIGHT = 0.064
-"""Height of the table top over the shoulder [m]."""
-GOAL_LOW, GOAL_HIGH = np.array([0.3, -0.25]), np.array([0.7, 0.25])
-"""Goal area on the table, x and y [m]."""
 BRAKE_ZONE = 0.15
 """Within this angle of a limit [rad] a joint cannot move further towards it."""
 BRAKE_LOW, BRAKE_HIGH = JOINT_LOW + BRAKE_ZONE, JOINT_HIGH - BRAKE_ZONE
-DOWN = np.array([0.0, 0.0, -1.0])
-
-Start = Literal["fixed", "random"]
 
 
-class WAMWipe(BatchedTask):
-    """Slide the tool face over a table to a goal, without pressing, lifting or tilting it (section A.1.1).
+class WAMTask(BatchedTask):
+    """N arms with a goal for the tool each, and failures that last.
 
-    Actuation: joint velocities ``(N, 7)`` [rad/s]. Reward: -1 a step, 0 within ``success_radius`` of the goal.
-    A violation (the face leaves the table's height by more than ``height_tolerance``, or tilts by more than
-    ``tilt_tolerance``) is a failure: from then on every step costs -1 and the episode cannot succeed.
+    Actuation: joint velocities ``(N, 7)`` [rad/s]. Reward: -1 a step, 0 at the goal. After a failure every step costs
+    -1 and the episode cannot succeed. A subclass draws starts and goals, observes, and says what a failure is and
+    what it means to be at the goal.
 
     Args:
+        model: the arm and what stands around it.
         num_envs: number of copies N.
         num_threads: native threads that share the copies.
         seed: seed of goals and starts.
-        start: ``"fixed"``, the authors' posture, or ``"random"``: a flush posture over the goal area whose elbow is
-            swivelled by up to ``swivel_range``.
-        swivel_range: largest turn of the shoulder yaw from the authors' posture [rad], for random starts.
-        height_tolerance: allowed distance from the table's height [m].
-        tilt_tolerance: allowed angle between the face normal and straight down [rad].
         success_radius: distance to the goal that counts as reached [m].
-        terminate_on_failure: end an episode at a violation; by default it goes on, absorbing.
-        terminate_on_success: end an episode at the goal, for demonstrations; by default it goes on.
+        tilt_tolerance: allowed angle of the face normal from the direction asked for [rad].
+        terminate_on_failure: end an episode at a failure; otherwise it goes on, absorbing.
+        terminate_on_success: end an episode at the goal, for demonstrations; otherwise it goes on.
         max_episode_steps: environment steps of 0.02 s in an episode.
 
     Raises:
-        ValueError: for an unknown start, or a tolerance or radius that is not positive.
+        ValueError: if the radius or the tolerance is not positive.
     """
 
-    observation_sizes: ClassVar[dict[str, int]] = {
-        "observation": 16,
-        "joint_angle": 7,
-        "tool_position": 3,
-        "goal": 3,
-    }
     reward_range = (-1.0, 0.0)
-    _episode_arrays = ("goal", "failed")
+    _episode_arrays: ClassVar[tuple[str, ...]] = ("goal", "failed")
 
     def __init__(
         self,
-        num_envs: int = 1,
-        num_threads: int = 1,
-        seed: int = 0,
+        model: mujoco.MjModel,
         *,
-        start: Start = "fixed",
-        swivel_range: float = 0.5,
-        height_tolerance: float = 0.015,
-        tilt_tolerance: float = math.pi / 16,
-        success_radius: float = 0.03,
-        terminate_on_failure: bool = False,
-        terminate_on_success: bool = False,
-        max_episode_steps: int = 200,
+        num_envs: int,
+        num_threads: int,
+        seed: int,
+        success_radius: float,
+        tilt_tolerance: float,
+        terminate_on_failure: bool,
+        terminate_on_success: bool,
+        max_episode_steps: int,
     ) -> None:
-        if start not in get_args(Start):
-            raise ValueError(f"start must be one of {get_args(Start)}, got {start!r}.")
-        positive = {
-            "height_tolerance": height_tolerance,
-            "tilt_tolerance": tilt_tolerance,
-            "success_radius": success_radius,
-        }
-        for name, value in positive.items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}.")
-        if not 0 <= swivel_range <= 1.5:
-            raise ValueError(f"swivel_range must lie in [0, 1.5] rad, got {swivel_range}.")
+        check_positive(tilt_tolerance=tilt_tolerance, success_radius=success_radius)
         super().__init__(
-            load_model(ASSETS / "wam_wipe.xml"),
+            model,
             num_envs=num_envs,
             substeps=10,
             max_episode_steps=max_episode_steps,
             num_threads=num_threads,
             seed=seed,
         )
-        self.start = start
-        self.swivel_range = swivel_range
-        self.height_tolerance = height_tolerance
-        self.tilt_tolerance = tilt_tolerance
         self.success_radius = success_radius
+        self.tilt_tolerance = tilt_tolerance
         self.terminate_on_failure = terminate_on_failure
         self.terminate_on_success = terminate_on_success
         self.goal: Array = np.zeros((num_envs, 3))
         self.failed: Flags = np.zeros(num_envs, dtype=bool)
-        self.reset()
+
+    @abstractmethod
+    def _violates(self) -> Flags:
+        """Whether the copies ``(N,)`` break a rule of the task where they are."""
+
+    @abstractmethod
+    def _at_goal(self) -> Flags:
+        """Whether the tools ``(N,)`` are where they should be."""
 
     @property
     def actuation_bounds(self) -> tuple[Array, Array]:
         """The joints' largest speed [rad/s] in both directions."""
         return np.full(7, -MAX_SPEED), np.full(7, MAX_SPEED)
-
-    def _draw_start(self, rows: NDArray[np.intp]) -> None:
-        count = len(rows)
-        goal_xy = self.rng.uniform(GOAL_LOW, GOAL_HIGH, (count, 2))
-        self.goal[rows] = np.column_stack([goal_xy, np.full(count, TABLE_HEIGHT)])
-        self.failed[rows] = False
-        self.qpos[rows] = START_POSTURE if self.start == "fixed" else self._draw_postures(count)
-        self._update_pose()
-
-    def _draw_postures(self, count: int) -> Array:
-        """Flush postures over the goal area with a random swivel, ``(count, 7)``."""
-        postures = np.empty((count, 7))
-        missing = np.arange(count)
-        for _ in range(100):
-            size = len(missing)
-            target = np.column_stack(
-                [self.rng.uniform(GOAL_LOW, GOAL_HIGH, (size, 2)), np.full(size, TABLE_HEIGHT)]
-            )
-            swivel = self.rng.uniform(-self.swivel_range, self.swivel_range, size)
-            found, reachable = flush_posture(target, swivel)
-            postures[missing[reachable]] = found[reachable]
-            missing = missing[~reachable]
-            if not len(missing):
-                return postures
-        raise RuntimeError(f"no flush posture within the joint limits for {len(missing)} of {count} starts.")
 
     def _apply(self, actuation: Array) -> None:
         self.qvel[:] = brake(self.qpos, actuation)
@@ -149,27 +89,13 @@ class WAMWipe(BatchedTask):
     def _update_pose(self) -> None:
         self._position, self._normal = tool_pose(self.qpos)
 
-    def observe(self) -> dict[str, Array]:
-        """Joint angles [rad], tool position and goal [m], and all of them with the face normal (16 numbers)."""
-        parts = [self.qpos, self._position, self.goal, self._normal]
-        return {
-            "observation": np.concatenate(parts, axis=1),
-            "joint_angle": self.qpos.copy(),
-            "tool_position": self._position.copy(),
-            "goal": self.goal.copy(),
-        }
-
     def _note_diverged(self, diverged: Flags) -> None:
         self.failed |= diverged
 
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
         self._update_pose()
-        off_table = np.abs(self._position[:, 2] - TABLE_HEIGHT) > self.height_tolerance
-        tilted = self._normal[:, 2] > -math.cos(self.tilt_tolerance)
-        self.failed |= off_table | tilted
-        to_goal = self.goal - self._position
-        near = np.einsum("ij,ij->i", to_goal, to_goal) < self.success_radius**2
-        success = near & ~self.failed
+        self.failed |= self._violates()
+        success = self._at_goal() & ~self.failed
         ended = (self.failed & self.terminate_on_failure) | (success & self.terminate_on_success)
         return success - 1.0, ended, success, self.failed.copy()
 
@@ -178,24 +104,26 @@ class WAMWipe(BatchedTask):
         super().load_state_dict(saved)
         self._update_pose()
 
-    def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
-        """Draw the goal as a disc, in a halo wider than the tool: green once reached, red after a violation."""
+    def _observe_arm(self) -> dict[str, Array]:
+        """What every task shows by its own key: joint angles [rad], tool position and goal [m]."""
+        return {
+            "joint_angle": self.qpos.copy(),
+            "tool_position": self._position.copy(),
+            "goal": self.goal.copy(),
+        }
+
+    def _colour(self, row: int) -> tuple[float, float, float]:
+        """Of the goal of copy ``row``: orange, green once reached, red after a failure."""
         if self.failed[row]:
-            colour = (0.85, 0.15, 0.15)
-        elif np.linalg.norm(self._position[row] - self.goal[row]) < self.success_radius:
-            colour = (0.2, 0.7, 0.25)
-        else:
-            colour = (0.95, 0.6, 0.1)
-        for radius, opacity in ((self.success_radius, 1.0), (2.5 * self.success_radius, 0.35)):
-            scene.ngeom += 1
-            mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom - 1],
-                mujoco.mjtGeom.mjGEOM_CYLINDER,
-                np.array([radius, 0.001, 0.0]),
-                self.goal[row] + np.array([0.0, 0.0, 0.001]),
-                np.eye(3).ravel(),
-                np.array([*colour, opacity], dtype=np.float32),
-            )
+            return 0.85, 0.15, 0.15
+        return (0.2, 0.7, 0.25) if self._at_goal()[row] else (0.95, 0.6, 0.1)
+
+
+def check_positive(**settings: float) -> None:
+    """Raise ValueError if one of the settings, given by name, is not positive."""
+    for name, value in settings.items():
+        if not value > 0:
+            raise ValueError(f"{name} must be positive, got {value}.")
 
 
 def brake(joint_angle: Array, velocity: Array) -> Array:
@@ -203,31 +131,3 @@ def brake(joint_angle: Array, velocity: Array) -> Array:
     to_low = (joint_angle < BRAKE_LOW) & (velocity < 0)
     to_high = (joint_angle > BRAKE_HIGH) & (velocity > 0)
     return np.where(to_low | to_high, 0.0, velocity)
-
-
-def flush_posture(target: Array, swivel: Array, iterations: int = 30) -> tuple[Array, Flags]:
-    """Postures with the tool face on ``target``, straight down, and the shoulder yaw turned by ``swivel``.
-
-    Newton steps of least norm on position and tilt, the shoulder yaw held.
-
-    Args:
-        target: centre of the tool face [m], ``(N, 3)``.
-        swivel: turn of the shoulder yaw from the authors' posture [rad], ``(N,)``.
-        iterations: Newton steps.
-
-    Returns:
-        joint angles ``(N, 7)`` [rad], and ``(N,)`` whether a posture was found outside the brakes' reach.
-    """
-    posture = np.tile(START_POSTURE, (len(target), 1))
-    posture[:, 2] += swivel
-    held = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
-    for _ in range(iterations):
-        pose = forward_kinematics(posture)
-        error = np.concatenate([target - pose.position, -pose.normal[:, :2]], axis=1)
-        jacobian = np.concatenate([pose.linear_jacobian(), pose.normal_jacobian()[:, :2]], axis=1) * held
-        posture = posture + np.clip(damped_solve(jacobian, error), -0.3, 0.3)
-    pose = forward_kinematics(posture)
-    exact = np.linalg.norm(pose.position - target, axis=1) < 1e-6
-    straight = pose.normal[:, 2] < -1 + 1e-9
-    inside = ((posture > BRAKE_LOW) & (posture < BRAKE_HIGH)).all(axis=1)
-    return posture, exact & straight & inside

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, BatchedTask, Flags, load_model
-from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, brake
+from nht.envs.task import ASSETS, Array, Flags, load_model
+from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, WAMTask
 from nht.envs.wam_collision import ArmGeoms
-from nht.envs.wam_kinematics import MAX_SPEED, damped_solve, forward_kinematics, tool_pose
+from nht.envs.wam_kinematics import damped_solve, forward_kinematics, tool_pose
 
 HOME = np.array([0.0, 0.5, 0.0, 2.1, 0.0, 0.3, 0.0])
 """Middle of the start postures [rad]: the tool hangs a quarter of a metre over the object."""
@@ -29,7 +29,7 @@ GRASP_POLAR_ANGLE = math.pi / 3
 """Largest angle between straight up and the direction from the object to a grasp point [rad]."""
 
 
-class WAMGrasp(BatchedTask):
+class WAMGrasp(WAMTask):
     """Bring the tool face to a random grasp point around an object, facing its centre (section A.1.2).
 
     Actuation: joint velocities ``(N, 7)`` [rad/s]. Reward: -1 a step, 0 while the tool is within ``success_radius`` of
@@ -61,8 +61,6 @@ class WAMGrasp(BatchedTask):
         "tool_position": 3,
         "goal": 3,
     }
-    _episode_arrays = ("goal", "failed")
-    reward_range = (-1.0, 0.0)
 
     def __init__(
         self,
@@ -77,33 +75,22 @@ class WAMGrasp(BatchedTask):
         terminate_on_success: bool = False,
         max_episode_steps: int = 200,
     ) -> None:
-        for name, value in {"tilt_tolerance": tilt_tolerance, "success_radius": success_radius}.items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}.")
         if not 0 <= start_noise <= 0.25:
             raise ValueError(f"start_noise must lie in [0, 0.25] rad, got {start_noise}.")
         super().__init__(
             grasp_model(),
             num_envs=num_envs,
-            substeps=10,
-            max_episode_steps=max_episode_steps,
             num_threads=num_threads,
             seed=seed,
+            success_radius=success_radius,
+            tilt_tolerance=tilt_tolerance,
+            terminate_on_failure=terminate_on_failure,
+            terminate_on_success=terminate_on_success,
+            max_episode_steps=max_episode_steps,
         )
         self.start_noise = start_noise
-        self.tilt_tolerance = tilt_tolerance
-        self.success_radius = success_radius
-        self.terminate_on_failure = terminate_on_failure
-        self.terminate_on_success = terminate_on_success
-        self.goal: Array = np.zeros((num_envs, 3))
-        self.failed: Flags = np.zeros(num_envs, dtype=bool)
         self._arm = ArmGeoms(self.model)
         self.reset()
-
-    @property
-    def actuation_bounds(self) -> tuple[Array, Array]:
-        """The joints' largest speed [rad/s] in both directions."""
-        return np.full(7, -MAX_SPEED), np.full(7, MAX_SPEED)
 
     def _draw_start(self, rows: NDArray[np.intp]) -> None:
         self.goal[rows] = draw_grasp_points(self.rng, len(rows))
@@ -112,30 +99,13 @@ class WAMGrasp(BatchedTask):
         self.qpos[rows] = HOME + self.start_noise * self.rng.uniform(-1.0, 1.0, (len(rows), 7))
         self._update_pose()
 
-    def _apply(self, actuation: Array) -> None:
-        self.qvel[:] = brake(self.qpos, actuation)
-
-    def _update_pose(self) -> None:
-        self._position, self._normal = tool_pose(self.qpos)
-
     def observe(self) -> dict[str, Array]:
         """Joint angles [rad], tool position and grasp point [m], and all of them in one (13 numbers)."""
-        return {
-            "observation": np.concatenate([self.qpos, self._position, self.goal], axis=1),
-            "joint_angle": self.qpos.copy(),
-            "tool_position": self._position.copy(),
-            "goal": self.goal.copy(),
-        }
+        parts = [self.qpos, self._position, self.goal]
+        return {"observation": np.concatenate(parts, axis=1), **self._observe_arm()}
 
-    def _note_diverged(self, diverged: Flags) -> None:
-        self.failed |= diverged
-
-    def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
-        self._update_pose()
-        self.failed |= clearance(self._arm, self.qpos) < 0
-        success = self._at_goal() & ~self.failed
-        ended = (self.failed & self.terminate_on_failure) | (success & self.terminate_on_success)
-        return np.where(success, 0.0, -1.0), ended, success, self.failed.copy()
+    def _violates(self) -> Flags:
+        return clearance(self._arm, self.qpos) < 0
 
     def _at_goal(self) -> Flags:
         to_goal = self.goal - self._position
@@ -143,22 +113,12 @@ class WAMGrasp(BatchedTask):
         to_centre = (OBJECT_CENTRE - self.goal) / GRASP_RADIUS
         return near & (np.einsum("ij,ij->i", to_centre, self._normal) > math.cos(self.tilt_tolerance))
 
-    def load_state_dict(self, saved: dict[str, Any]) -> None:
-        """Go on from what ``state_dict`` returned."""
-        super().load_state_dict(saved)
-        self._update_pose()
-
     def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
         """Draw the grasp point, in a halo wider than the tool, and the line on which the tool's axis has to lie.
 
         Orange, green once the goal is reached, red after a collision.
         """
-        if self.failed[row]:
-            colour = (0.85, 0.15, 0.15)
-        elif self._at_goal()[row]:
-            colour = (0.2, 0.7, 0.25)
-        else:
-            colour = (0.95, 0.6, 0.1)
+        colour = self._colour(row)
         sphere, line = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE
         goal = self.goal[row]
         outward = (goal - OBJECT_CENTRE) / GRASP_RADIUS

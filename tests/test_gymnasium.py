@@ -13,9 +13,9 @@ from torchrl.envs.utils import check_env_specs
 
 from fresh_process import run
 from nht.envs import GYMNASIUM_IDS, make_env
-from nht.envs.wam import GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT
 from nht.envs.wam_grasp import HOME, grasp_point, grasp_posture
 from nht.envs.wam_kinematics import tool_pose
+from nht.envs.wam_wipe import GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT
 
 
 @pytest.fixture(params=sorted(GYMNASIUM_IDS))

@@ -8,16 +8,7 @@ import pytest
 from mujoco import mjtObj
 
 from nht.envs import make_expert, make_task
-from nht.envs.wam import (
-    BRAKE_ZONE,
-    DOWN,
-    GOAL_HIGH,
-    GOAL_LOW,
-    START_POSTURE,
-    TABLE_HEIGHT,
-    brake,
-    flush_posture,
-)
+from nht.envs.wam import BRAKE_ZONE, brake
 from nht.envs.wam_kinematics import (
     JOINT_HIGH,
     JOINT_LOW,
@@ -26,6 +17,7 @@ from nht.envs.wam_kinematics import (
     forward_kinematics,
     tool_pose,
 )
+from nht.envs.wam_wipe import DOWN, GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT, flush_posture
 
 STILL = np.zeros(7)
 AT = np.array([0.5, 0.05, TABLE_HEIGHT])  # somewhere on the table
