@@ -92,6 +92,9 @@ class DDPGConfig(AlgoConfig):
     actor_learning_rate: float = 1e-3
     critic_learning_rate: float = 1e-3
     gamma: float = 0.98
+    n_steps: int = (
+        1  # rewards that a target adds up before it trusts the critic, within a batch of the collector
+    )
     polyak: float = 0.96  # share of the old target network that stays at each move
     target_update_every: int = 1  # gradient steps between two moves of the target networks
     action_l2: float = 0.05  # weight of the mean squared action in the actor's loss
@@ -108,7 +111,8 @@ class DDPGConfig(AlgoConfig):
         for name in ("polyak", "random_action", "pessimism"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"algo.{name} must lie in [0, 1], got {getattr(self, name)}.")
-        for name in ("total_frames", "frames_per_batch", "batch_size", "buffer_size", "target_update_every"):
+        counts = ("total_frames", "frames_per_batch", "n_steps", "batch_size", "buffer_size")
+        for name in (*counts, "target_update_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"algo.{name} must be at least 1, got {getattr(self, name)}.")
         for name in ("action_l2", "exploration_noise", "updates_per_batch", "warmup_frames"):

@@ -14,7 +14,7 @@ from torchrl.objectives import SoftUpdate
 from nht.recipes.config import DDPG
 from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
-from nht.recipes.losses import PaperDDPGLoss, charge_failure, reward_range
+from nht.recipes.losses import PaperDDPGLoss, charge_failure, n_step_returns, reward_range
 from nht.recipes.networks import ddpg_networks, exploring
 from nht.recipes.training import TrainingRun
 
@@ -25,6 +25,7 @@ STORED = (
     ("next", "reward"),
     ("next", "done"),
     ("next", "terminated"),
+    "steps_to_next_obs",
 )
 
 
@@ -37,6 +38,7 @@ def main(config: DDPG) -> None:
 
     rewards = reward_range(run.env)
     loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
+    look_ahead = n_step_returns(algo.gamma, algo.n_steps)
     target = SoftUpdate(loss, eps=algo.polyak)
     optimiser = torch.optim.Adam(
         [
@@ -59,10 +61,10 @@ def main(config: DDPG) -> None:
     run.start(collector, loss=loss, optimiser=optimiser, features=features, buffer=buffer)
 
     for data in collector:
-        data = charge_failure(data.reshape(-1), algo.gamma, rewards)
-        features.module.update(data["observation"])
-        buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
         run.count_steps(data)
+        features.module.update(data["observation"])
+        data = look_ahead(charge_failure(data, algo.gamma, rewards)).reshape(-1)
+        buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
 
         for _ in range(algo.updates_per_batch if run.counters.frames >= algo.warmup_frames else 0):
             batch = buffer.sample().to(config.device)

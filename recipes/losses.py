@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torchrl.data.postprocs import MultiStep
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, DDPGLoss
 from torchrl.objectives.value import GAE, TD0Estimator
@@ -96,6 +97,17 @@ def charge_failure(
         fatal = outcome["failure"] & outcome["terminated"]
         outcome["reward"] = torch.where(fatal, lowest, outcome["reward"])
     return tensordict
+
+
+def n_step_returns(gamma: float, steps: int) -> MultiStep:
+    """TorchRL's ``MultiStep``, which turns collected steps ``(copies, T)`` into ones of up to ``steps`` rewards.
+
+    Left as it is, it moves observations ahead but not the flags of their ends, and a target that meets a failure would
+    go on to the critic's value of what it led to.
+    """
+    multi_step = MultiStep(gamma, steps)
+    multi_step.done_keys = ()
+    return multi_step
 
 
 class GaussianPPOLoss(ClipPPOLoss):

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from nht.envs import make_env
-from nht.recipes.losses import PaperDDPGLoss, charge_failure, return_range, reward_range
+from nht.recipes.losses import PaperDDPGLoss, charge_failure, n_step_returns, return_range, reward_range
 from nht.recipes.networks import RunningNorm
 
 GAMMA = 0.9
@@ -94,6 +94,38 @@ def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
     assert return_range((-1.0, 0.0), GAMMA, steps=2) == pytest.approx((-1.9, 0.0))
     assert return_range((-1.0, 2.0), 1.0, steps=200) == (-200.0, 400.0)
     assert charged.tolist() == pytest.approx([-10.0, -1.0, -1.0, -1.0])
+
+
+def test_targets_look_ahead_to_the_end_of_an_episode_and_no_further():
+    # Two copies, five steps of reward -1. The first fails in its third step, the second runs into its time limit.
+    terminated, truncated = torch.zeros(2, 2, 5, 1, dtype=torch.bool)
+    terminated[0, 2] = truncated[1, 2] = True
+    time = torch.arange(5.0).expand(2, 5).unsqueeze(-1)
+    outcome = {"features": time + 1.0, "reward": -torch.ones(2, 5, 1), "failure": terminated.clone()}
+    outcome |= {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+    collected = TensorDict({"features": time, "action": torch.zeros(2, 5, 1), "next": outcome}, [2, 5])
+
+    ahead = n_step_returns(GAMMA, 2)(charge_failure(collected, GAMMA))
+
+    assert ahead["steps_to_next_obs"].tolist() == [[2, 2, 1, 2, 1]] * 2  # a batch is an end, too
+    assert ahead["next", "features"].squeeze(-1).tolist() == [[2.0, 3.0, 3.0, 5.0, 5.0]] * 2
+    assert ahead["next", "terminated"].squeeze(-1).tolist() == [
+        [False, True, True, False, False],
+        [False] * 5,
+    ]
+    # the next action is half the features, and the critic's value their sum
+    targets = [
+        loss(reward_range=(-math.inf, math.inf))(ahead[:, i])["target_value"].tolist() for i in range(5)
+    ]
+    value = {features: 1.5 * features for features in (2.0, 3.0, 5.0)}
+    expected = [
+        [-1.9 + 0.81 * value[2.0], -1.9 + 0.81 * value[2.0]],
+        [-1.0 - 0.9 * 10.0, -1.9 + 0.81 * value[3.0]],
+        [-10.0, -1.0 + 0.9 * value[3.0]],
+        [-1.9 + 0.81 * value[5.0], -1.9 + 0.81 * value[5.0]],
+        [-1.0 + 0.9 * value[5.0], -1.0 + 0.9 * value[5.0]],
+    ]
+    torch.testing.assert_close(torch.tensor(targets), torch.tensor(expected))
 
 
 def test_running_norm_equals_the_mean_and_deviation_of_all_it_saw():
