@@ -30,7 +30,7 @@ from nht.recipes.config import DDPG
 from nht.recipes.ddpg import STORED, main
 from nht.recipes.environments import mapped_env
 from nht.recipes.launch import configure
-from nht.recipes.losses import PaperDDPGLoss
+from nht.recipes.losses import PaperDDPGLoss, n_step_returns
 from nht.recipes.networks import ddpg_networks, exploring
 
 ROUNDS = 4
@@ -55,8 +55,13 @@ def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
         auto_register_policy_transforms=True,
     )
     batches = iter(collector)
-    stored = next(batches).reshape(-1).select(*STORED).clone()
-    buffer.extend(stored)
+    look_ahead = n_step_returns(algo.gamma, algo.n_steps)
+    collected = next(batches).clone()
+
+    def store() -> None:
+        buffer.extend(look_ahead(collected).reshape(-1).select(*STORED))
+
+    store()
     batch = buffer.sample()
 
     def normalise() -> None:
@@ -70,7 +75,7 @@ def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
     normalise()
     return {
         "collect": lambda: next(batches),
-        "store": lambda: buffer.extend(stored),
+        "store": store,
         "sample": buffer.sample,
         "normalise": normalise,
         "loss and backward": descend,

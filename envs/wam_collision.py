@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,19 @@ CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE.value
 CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER.value
 
 
+class Placed(NamedTuple):
+    """The G geoms of an arm and its tool, in N postures."""
+
+    centre: Array
+    """Centres of the geoms [m], ``(3, G, N)``."""
+    axis: Array
+    """Unit vectors along the geoms, ``(3, G, N)``."""
+    tool_position: Array
+    """Origin of the tool's frame [m], ``(N, 3)``."""
+    tool_axis: Array
+    """Its z axis, ``(N, 3)``."""
+
+
 class ArmGeoms:
     """The spheres, capsules and cylinders that a serial arm of hinges moves, placed for N postures together.
 
@@ -21,10 +36,10 @@ class ArmGeoms:
     lie at joint angles 0, the last joint first (the product of exponentials). What no joint moves is left out.
 
     Args:
-        model: every joint is a hinge, in a body below that of the joint before.
+        model: every joint is a hinge, in a body below that of the joint before; the last one moves a site ``"tool"``.
 
     Raises:
-        ValueError: if the joints are others, or a moving geom is of another type.
+        ValueError: if the joints are others, a moving geom is of another type or there is no such site.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -38,15 +53,20 @@ class ArmGeoms:
                     f"the moving geom {model.geom(geom).name!r} must be a sphere, a capsule or a cylinder, "
                     f"got {mujoco.mjtGeom(model.geom_type[geom]).name}."
                 )
+        tool = _tool_site(model, depth)
         self.names: list[str] = [model.geom(geom).name for geom in geoms]
         """The geoms in the order of all distances."""
-        self._moved = [int((depth[model.geom_bodyid[geoms]] > joint).sum()) for joint in range(model.njnt)]
+        self._moved = [
+            1 + int((depth[model.geom_bodyid[geoms]] > joint).sum()) for joint in range(model.njnt)
+        ]
 
         data = mujoco.MjData(model)
         data.qpos[:] = 0.0
         mujoco.mj_kinematics(model, data)
-        axes = data.geom_xmat[geoms, 2::3]
-        self._at_zero = np.stack([data.geom_xpos[geoms].T, axes.T], axis=-1)[..., None]  # (3, G, 2, 1)
+        # The tool goes first: every joint moves it. (3, 1 + G, 2, 1)
+        centres = np.concatenate([data.site_xpos[tool, None], data.geom_xpos[geoms]])
+        axes = np.concatenate([data.site_xmat[tool, None, 2::3], data.geom_xmat[geoms, 2::3]])
+        self._at_zero = np.stack([centres.T, axes.T], axis=-1)[..., None]
         self._planes = [_turned_plane(axis) for axis in data.xaxis]
         # Centres turn about the hinge, directions about the origin: (3, 1, 2, 1) for each hinge beside the origin.
         shifts = [
@@ -60,8 +80,8 @@ class ArmGeoms:
         self._radius: Array = np.where(types == CYLINDER, radius, 0.0)[:, None]
         self._margin: Array = np.where(types == CYLINDER, 0.0, radius)[:, None]
 
-    def place(self, joint_angle: Array) -> tuple[Array, Array]:
-        """Centres [m] and axes of the G geoms at the joint angles ``(N, joints)`` [rad], each ``(3, G, N)``."""
+    def place(self, joint_angle: Array) -> Placed:
+        """Where geoms and tool are at the joint angles ``(N, joints)`` [rad]."""
         cos, sin = np.cos(joint_angle.T), np.sin(joint_angle.T)
         placed = np.repeat(self._at_zero, len(joint_angle), axis=-1)
         for joint in reversed(range(len(self._moved))):
@@ -73,9 +93,10 @@ class ArmGeoms:
             moved[i], moved[j] = cos[joint] * x - sin[joint] * y, sin[joint] * x + cos[joint] * y
             if anchor is not None:
                 moved += anchor
-        return placed[:, :, 0], placed[:, :, 1]
+        centre, axis = placed[:, :, 0], placed[:, :, 1]
+        return Placed(centre[:, 1:], axis[:, 1:], centre[:, 0].T.copy(), axis[:, 0].T.copy())
 
-    def distance_to_sphere(self, placed: tuple[Array, Array], centre: Array, radius: float) -> Array:
+    def distance_to_sphere(self, placed: Placed, centre: Array, radius: float) -> Array:
         """Signed distances ``(N, G)`` [m] to a ball, negative where a geom cuts into it.
 
         Args:
@@ -83,9 +104,8 @@ class ArmGeoms:
             centre: of the ball [m], ``(3,)``.
             radius: of the ball [m].
         """
-        middle, axis = placed
-        to_ball = centre[:, None, None] - middle
-        along = np.einsum("ign,ign->gn", to_ball, axis)
+        to_ball = centre[:, None, None] - placed.centre
+        along = np.einsum("ign,ign->gn", to_ball, placed.axis)
         beside = np.einsum("ign,ign->gn", to_ball, to_ball) - along * along
         # How far beyond the cylinder's side and its cap, negative within.
         side = np.sqrt(np.maximum(beside, 0.0)) - self._radius
@@ -93,12 +113,11 @@ class ArmGeoms:
         outside = np.hypot(np.maximum(side, 0.0), np.maximum(cap, 0.0))
         return (outside + np.minimum(np.maximum(side, cap), 0.0) - (self._margin + radius)).T
 
-    def distance_to_floor(self, placed: tuple[Array, Array], height: float) -> Array:
+    def distance_to_floor(self, placed: Placed, height: float) -> Array:
         """Signed distances ``(N, G)`` [m] to everything below a height [m], negative where a geom dips into it."""
-        middle, axis = placed
-        upright = np.abs(axis[2])
+        upright = np.abs(placed.axis[2])
         rim = self._radius * np.sqrt(np.maximum(1.0 - upright * upright, 0.0))
-        return (middle[2] - self._half * upright - rim - (self._margin + height)).T
+        return (placed.centre[2] - self._half * upright - rim - (self._margin + height)).T
 
 
 def _turned_plane(axis: Array) -> tuple[int, int]:
@@ -108,6 +127,14 @@ def _turned_plane(axis: Array) -> tuple[int, int]:
         raise ValueError(f"the arm's hinges must lie along x, y or z at joint angles 0, got {axis}.")
     plane = (along + 1) % 3, (along + 2) % 3
     return plane if axis[along] > 0 else plane[::-1]
+
+
+def _tool_site(model: mujoco.MjModel, depth: NDArray[np.intp]) -> int:
+    """The index of the site ``"tool"``, which all joints have to move."""
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tool")
+    if site < 0 or depth[model.site_bodyid[site]] < model.njnt:
+        raise ValueError('the arm must have a site "tool" that its last joint moves.')
+    return site
 
 
 def _moving_joints(model: mujoco.MjModel) -> NDArray[np.intp]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nht.envs.task import ASSETS, Array, Flags, load_model
 from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, WAMTask
-from nht.envs.wam_collision import ArmGeoms
+from nht.envs.wam_collision import ArmGeoms, Placed
 from nht.envs.wam_kinematics import damped_solve, forward_kinematics, tool_pose
 
 HOME = np.array([0.0, 0.5, 0.0, 2.1, 0.0, 0.3, 0.0])
@@ -104,8 +104,12 @@ class WAMGrasp(WAMTask):
         parts = [self.qpos, self._position, self.goal]
         return {"observation": np.concatenate(parts, axis=1), **self._observe_arm()}
 
+    def _update_pose(self) -> None:
+        self._placed = self._arm.place(self.qpos)
+        self._position, self._normal = self._placed.tool_position, self._placed.tool_axis
+
     def _violates(self) -> Flags:
-        return clearance(self._arm, self.qpos) < 0
+        return clearance(self._arm, self._placed) < 0
 
     def _at_goal(self) -> Flags:
         to_goal = self.goal - self._position
@@ -144,9 +148,8 @@ def grasp_model() -> mujoco.MjModel:
     return load_model(ASSETS / "wam_grasp.xml")
 
 
-def clearance(arm: ArmGeoms, joint_angle: Array) -> Array:
+def clearance(arm: ArmGeoms, placed: Placed) -> Array:
     """Distance ``(N,)`` [m] of the whole moving arm from object and table; negative where it cuts into one of them."""
-    placed = arm.place(joint_angle)
     to_object = arm.distance_to_sphere(placed, OBJECT_CENTRE, OBJECT_RADIUS)
     return np.minimum(to_object, arm.distance_to_floor(placed, TABLE_TOP)).min(axis=1)
 
@@ -186,7 +189,7 @@ def reachable_polar_angle() -> tuple[Array, Array]:
     for polar in np.arange(0.0, GRASP_POLAR_ANGLE + 1e-9, degree):
         posture, exact = grasp_posture(grasp_point(np.full(count, polar), azimuth), posture, iterations=6)
         inside = ((posture > BRAKE_LOW) & (posture < BRAKE_HIGH)).all(axis=1)
-        going &= exact & inside & (clearance(arm, posture) > 0)
+        going &= exact & inside & (clearance(arm, arm.place(posture)) > 0)
         limit[going] = polar
     return azimuth, np.where(going, GRASP_POLAR_ANGLE, limit - degree)
 

@@ -48,6 +48,7 @@ SNAKE = """
           <joint axis="{second}" pos="-0.1 0 0.02" ref="0.3"/>
           <geom name="sphere" type="{shape}" pos="0.05 0 0.02" size="0.06 0.06 0.06"/>
           <geom name="cylinder" type="cylinder" pos="0.1 0.1 0" euler="20 70 0" size="0.05 0.1"/>
+          <site name="{tool}" pos="0.2 0.1 -0.1" euler="10 50 0"/>
         </body>
       </body>
     </body>
@@ -55,10 +56,21 @@ SNAKE = """
 </mujoco>"""
 
 
-def snake(joints='<joint axis="0 -1 0"/>', second="1 0 0", shape="sphere", turned=False):
+def snake(joints='<joint axis="0 -1 0"/>', second="1 0 0", shape="sphere", tool="tool", turned=False):
     """A chain of two hinges that carries all kinds of geoms."""
-    xml = SNAKE.format(joints=joints, second=second, shape=shape)
+    xml = SNAKE.format(joints=joints, second=second, shape=shape, tool=tool)
     return mujoco.MjModel.from_xml_string(xml if turned else xml.replace('euler="30 40 50"', ""))
+
+
+def test_tool_is_where_mujoco_puts_it():
+    model = snake()
+    data = mujoco.MjData(model)
+    postures = np.random.default_rng(0).uniform(-4, 4, (50, 2))
+    placed = ArmGeoms(model).place(postures)
+    for i, data.qpos[:] in enumerate(postures):
+        mujoco.mj_kinematics(model, data)
+        np.testing.assert_allclose(placed.tool_position[i], data.site("tool").xpos, atol=1e-12)
+        np.testing.assert_allclose(placed.tool_axis[i], data.site("tool").xmat[2::3], atol=1e-12)
 
 
 def by_mujoco(model, arm, postures, ball, ground):
@@ -103,7 +115,7 @@ def test_distances_and_contacts_of_the_arm_are_mujocos():
     theirs[:, 1, drum] = -0.11 - TABLE_TOP
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
     np.testing.assert_array_equal(ours < 0, contacts)
-    np.testing.assert_array_equal(clearance(arm, postures) < 0, contacts.any(axis=(1, 2)))
+    np.testing.assert_array_equal(clearance(arm, placed) < 0, contacts.any(axis=(1, 2)))
     hits = contacts.sum(axis=0)
     assert (hits[:, [arm.names.index(name) for name in ("tool_pad", "palm", "wrist", "forearm")]] > 0).all()
 
@@ -143,6 +155,7 @@ def test_spheres_and_other_hinges():
         ({"joints": '<joint type="slide"/>'}, "must all be hinges"),
         ({"joints": ""}, None),
         ({"joints": '<joint/><body name="twig"><joint/><geom size="1"/></body>'}, "must be one chain"),
+        ({"tool": "thumb"}, 'must have a site "tool" that its last joint moves'),
         ({"turned": True}, "must lie along x, y or z at joint angles 0"),
     ],
 )
@@ -168,7 +181,8 @@ def test_grasp_points_lie_on_their_sphere_and_can_all_be_reached():
     assert exact.all()
     assert brake(posture, np.ones((3000, 7))).all()
     assert brake(posture, -np.ones((3000, 7))).all()
-    assert clearance(ArmGeoms(grasp_model()), posture).min() > 0.04
+    arm = ArmGeoms(grasp_model())
+    assert clearance(arm, arm.place(posture)).min() > 0.04
     position, normal = tool_pose(posture)
     np.testing.assert_allclose(position, points, atol=1e-6)
     np.testing.assert_allclose(normal, -outward, atol=1e-6)
@@ -206,7 +220,8 @@ def test_starts(start_noise):
     np.testing.assert_array_equal(brake(task.qpos, np.full((3000, 7), -MAX_SPEED)), -MAX_SPEED)
     assert not step(task).failure.any()
     corners = HOME + start_noise * np.array(np.meshgrid(*[[-1, 1]] * 7)).reshape(7, -1).T
-    assert clearance(ArmGeoms(task.model), corners).min() > 0.01
+    arm = ArmGeoms(task.model)
+    assert clearance(arm, arm.place(corners)).min() > 0.01
 
 
 def test_observation_is_angles_tool_and_grasp_point():
