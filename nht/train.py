@@ -26,8 +26,8 @@ class MapTraining(NamedTuple):
 
     Attributes:
         map: the map that was handed in, trained, in eval mode.
-        metrics: relative projection errors "validation_error" (on the held-out episodes) and "training_error"
-            (on the others); "steps", "best_step", "seconds"; "certificate", "action_scale"; "transitions",
+        metrics: relative projection errors "validation_error" (on what was held out) and "training_error"
+            (on the rest); "steps", "best_step", "seconds"; "certificate", "action_scale"; "transitions",
             "training_episodes", "validation_episodes".
     """
 
@@ -61,7 +61,7 @@ def train_map(
         learning_rate: of Adam, at the start.
         max_steps: of gradient descent, at most.
         patience: steps without a better validation error after which training ends.
-        validation_share: of the episodes, held out; at least one episode.
+        validation_share: of the episodes, held out; at least one episode. Of a single episode, its last part.
         seed: of the split and of the batches. The initial weights have their own, an argument of the map.
         progress: called at every evaluation with "step", "loss", "validation_error" and "seconds".
 
@@ -121,10 +121,15 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
 
 
 def split_episodes(episode: Tensor, share: float, seed: int) -> Tensor:
-    """Holds out a share of the episodes, at least one, never all: (T,) -> (T,) bool, true where held out."""
+    """Holds out a share of the episodes, at least one, never all: (T,) -> (T,) bool, true where held out.
+
+    Of a single episode its last steps are held out: neighbours in time are too alike to be drawn at random.
+    """
     names = torch.unique(episode)
+    if len(names) == 1 and len(episode) > 1:
+        return torch.arange(len(episode)) >= len(episode) - max(1, round(share * len(episode)))
     if len(names) < 2:
-        raise ValueError(f"at least 2 episodes are needed, to hold one out, but there is {len(names)}")
+        raise ValueError(f"at least 2 transitions are needed, to hold one out, but there is {len(episode)}")
     count = min(max(1, round(share * len(names))), len(names) - 1)
     order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))
     return torch.isin(episode, names[order[:count]])

@@ -224,14 +224,21 @@ def test_fewer_independent_actuations_than_k_are_refused(demos: Demos) -> None:
     assert fit(flat(demos, 1), nht.Identity(N, CONTEXT_DIM)).metrics["validation_error"] == 0
 
 
-def test_a_single_episode_cannot_be_split() -> None:
-    demos = Demos.from_tensors(
-        actuation=torch.ones(5, N),
-        episode=torch.zeros(5, dtype=torch.long),
-        context=torch.ones(5, CONTEXT_DIM),
+def test_of_a_single_episode_the_end_is_held_out(demos: Demos) -> None:
+    alone = torch.full((1000,), 7)
+    assert split_episodes(alone, 0.1, seed=0).nonzero().flatten().tolist() == list(range(900, 1000))
+    assert split_episodes(alone[:2], 0.1, seed=0).tolist() == [False, True]
+    one = Demos.from_tensors(
+        actuation=demos.actuation,
+        episode=torch.zeros_like(demos.episode),
+        context={"pose": demos.context(["pose"])},
     )
-    with pytest.raises(ValueError, match="at least 2 episodes are needed, to hold one out, but there is 1"):
-        train_map(demos, nht.NHT(CONTEXT_DIM, N, 1))
+    metrics = fit(one, nht.SVD(N, K, CONTEXT_DIM)).metrics
+    assert metrics["training_episodes"] == metrics["validation_episodes"] == 1
+    with pytest.raises(
+        ValueError, match="at least 2 transitions are needed, to hold one out, but there is 1"
+    ):
+        split_episodes(alone[:1], 0.1, seed=0)
 
 
 def test_actuations_of_zero_have_no_relative_error() -> None:
