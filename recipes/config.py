@@ -307,6 +307,12 @@ class Report:
     runs: list[str] = field(default_factory=list)  # folders of runs, or folders that hold them
     out: str = ""
     title: str = ""
+    metric: str = "success"  # or return: what the table and the curves show of every evaluation
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a metric that evaluations do not have."""
+        if self.metric not in ("success", "return"):
+            raise ValueError(f"metric must be success or return, got {self.metric!r}.")
 
 
 @dataclass

@@ -5,6 +5,7 @@ python -m nht.recipes.report runs=[runs/demo] out=runs/demo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -26,16 +27,16 @@ CONFIDENCE = 0.95
 
 
 def main(config: Report) -> None:
-    """Read the runs, then write ``curves.csv``, ``table.md`` and ``success.png``, and print the table."""
+    """Read the runs, write ``curves.csv``, ``table.md`` and the curves of ``metric``, and print the table."""
     out = Path(config.out)
     out.mkdir(parents=True, exist_ok=True)
     curves = read_runs([Path(folder) for folder in config.runs])
     curves.to_csv(out / "curves.csv", index=False)
-    table = summarise(curves)
+    table = summarise(curves, config.metric)
     (out / "table.md").write_text(to_markdown(table))
-    plot(curves, config.title, out / "success.png")
+    plot(curves, config.metric, config.title, out / f"{config.metric}.png")
     print(table.to_string(index=False))
-    print(f"\n{out}: curves.csv, table.md, success.png")
+    print(f"\n{out}: curves.csv, table.md, {config.metric}.png")
 
 
 def read_runs(folders: list[Path]) -> pandas.DataFrame:
@@ -59,36 +60,48 @@ def _read_run(metrics: Path) -> pandas.DataFrame:
     return rows
 
 
-def summarise(curves: pandas.DataFrame) -> pandas.DataFrame:
-    """Per interface: seeds, steps, final success with its interval, and steps to a success of 0.9 (median)."""
+def summarise(curves: pandas.DataFrame, metric: str = "success") -> pandas.DataFrame:
+    """Per interface: seeds, steps, and the mean and interquartile mean over seeds of the last evaluation.
+
+    For success also the failures, and the median of the steps to a success of 0.9.
+    """
     rows = []
+    shown = "{:.3f}" if metric == "success" else "{:,.0f}"
     for interface, group in curves.groupby("interface", sort=False):
         last = group[group["frames"] == group["frames"].max()]
-        low, high = interval(last["eval_success"].to_numpy())
-        reached = group[group["eval_success"] >= 0.9].groupby("seed")["frames"].min()
-        every = len(reached) == group["seed"].nunique()
-        rows.append(
-            {
-                "interface": interface,
-                "seeds": group["seed"].nunique(),
-                "steps": int(group["frames"].max()),
-                "success": f"{last['eval_success'].mean():.3f}",
-                "95 %": f"{low:.3f} .. {high:.3f}",
-                "failure": f"{last['eval_failure'].mean():.3f}",
-                "steps to 0.9": f"{int(reached.median()):,}" if every else f"{len(reached)} seeds got there",
-                "minutes": f"{last['seconds'].mean() / 60:.1f}",
-            }
-        )
+        scores = last[f"eval_{metric}"].to_numpy()
+        row = {
+            "interface": interface,
+            "seeds": group["seed"].nunique(),
+            "steps": int(group["frames"].max()),
+            metric: shown.format(scores.mean()),
+            "95 %": " .. ".join(map(shown.format, interval(scores))),
+            "IQM": shown.format(interquartile_mean(scores)),
+            "95 % of it": " .. ".join(map(shown.format, interval(scores, interquartile_mean))),
+        }
+        if metric == "success":
+            reached = group[group["eval_success"] >= 0.9].groupby("seed")["frames"].min()
+            every = len(reached) == group["seed"].nunique()
+            row["failure"] = f"{last['eval_failure'].mean():.3f}"
+            row["steps to 0.9"] = f"{int(reached.median()):,}" if every else f"{len(reached)} seeds got there"
+        rows.append(row | {"minutes": f"{last['seconds'].mean() / 60:.1f}"})
     return pandas.DataFrame(rows)
 
 
-def interval(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Bootstrap interval of the mean over seeds (percentiles, with a generator of its own); a point for one seed."""
-    if len(values) < 2 or np.ptp(values) == 0:
-        return float(values.mean()), float(values.mean())
+def interquartile_mean(scores: NDArray[np.float64], axis: int = 0) -> NDArray[np.float64]:
+    """The mean of the middle half of the scores."""
+    return stats.trim_mean(scores, 0.25, axis=axis)
+
+
+def interval(
+    scores: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]] = np.mean
+) -> tuple[float, float]:
+    """Bootstrap interval of a statistic over seeds (percentiles, a generator of its own); a point for one seed."""
+    if len(scores) < 2 or np.ptp(scores) == 0:
+        return float(scores.mean()), float(scores.mean())
     found = stats.bootstrap(
-        (values,),
-        np.mean,
+        (scores,),
+        statistic,
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
@@ -104,21 +117,23 @@ def to_markdown(table: pandas.DataFrame) -> str:
     return "\n".join(lines) + "\n"
 
 
-def plot(curves: pandas.DataFrame, title: str, path: Path) -> None:
-    """Mean success over the seeds of every interface, with its interval, against environment steps."""
+def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path) -> None:
+    """Mean over the seeds of every interface, with its interval, against environment steps."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for interface, group in curves.groupby("interface", sort=False):
-        by_frames = group.groupby("frames")["eval_success"]
+        by_frames = group.groupby("frames")[f"eval_{metric}"]
         frames = np.array(list(by_frames.groups))
         bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
         seeds = group["seed"].nunique()
         label = f"{interface} ({seeds} seed{'s' if seeds > 1 else ''})"
         (line,) = axes.plot(frames, by_frames.mean(), label=label)
         axes.fill_between(frames, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.2, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03), title=title)
+    axes.set(xlabel="environment steps", ylabel=f"{metric} of test episodes", title=title)
+    if metric == "success":
+        axes.set(ylim=(-0.03, 1.03))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k")
     axes.grid(alpha=0.3)
-    axes.legend(loc="center right")
+    axes.legend(loc="best")
     figure.savefig(path, dpi=150)
     plt.close(figure)
 

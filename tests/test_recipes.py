@@ -178,12 +178,30 @@ def test_report_compares_the_runs_below_a_folder(run, map_file, tmp_path):
     assert iio.imread(out / "success.png").ndim == 3
 
 
+def test_report_of_returns(run, tmp_path):
+    folder, metrics = run
+    out = tmp_path / "report"
+    report.main(configure(Report, "report", [f"runs=[{folder}]", f"out={out}", "metric=return"]))
+    last = f"{metrics['eval_return'].iloc[-1]:,.0f}"
+    assert f"| nht | 1 | 2000 | {last} | {last} .. {last} | {last} |" in (out / "table.md").read_text()
+    assert iio.imread(out / "return.png").ndim == 3
+    with pytest.raises(ValueError, match="metric must be success or return, got 'reward'"):
+        Report(metric="reward")
+
+
 def test_report_interval_is_seeded_and_covers_the_mean():
     scores = torch.tensor([0.2, 0.4, 0.9, 0.95, 1.0], dtype=torch.float64).numpy()
     low, high = report.interval(scores)
     assert low < scores.mean() < high
     assert report.interval(scores) == (low, high)
     assert report.interval(scores[:1]) == (0.2, 0.2)
+
+
+def test_interquartile_mean_leaves_out_the_best_and_the_worst_quarter():
+    scores = torch.tensor([-100.0, 1.0, 2.0, 6.0, 1000.0], dtype=torch.float64).numpy()
+    assert report.interquartile_mean(scores) == 3.0
+    low, high = report.interval(scores, report.interquartile_mean)
+    assert -100.0 < low < 3.0 < high < 1000.0
 
 
 # Bad input.
