@@ -59,7 +59,8 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
         column[0].set_title(f"{name}: {kind}", fontsize=10)
         column[-1].set_xlabel("step")
     motors = [f"motor {motor + 1}" for motor in range(actuation.shape[-1])]
-    figure.legend(panels[0, 0].lines[:-1], motors, loc="outside lower center", ncols=7, frameon=False)
+    columns = min(7, 2 * len(maps))  # as many as there is room for
+    figure.legend(panels[0, 0].lines[:-1], motors, loc="outside lower center", ncols=columns, frameon=False)
     _save(figure, path)
 
 
