@@ -235,26 +235,33 @@ def benchmark(task: str, rounds: int) -> None:
         measured["nht"].append(recipe_seconds(task))
         for name, iterate in contestants.items():
             measured[name].append(timed(iterate, times=1))
-    report(task, {name: values[1:] for name, values in measured.items()})
+    report("ppo_speed", task, STEPS, {name: values[1:] for name, values in measured.items()})
 
 
-def report(task: str, measured: dict[str, list[tuple[float, float]]]) -> None:
-    """Print and save environment steps per CPU second and per second, and CPU time over ours."""
+def report(name: str, task: str, steps: int, measured: dict[str, list[tuple[float, float]]]) -> None:
+    """Print and save environment steps per CPU second and per second, and CPU time over ours.
+
+    Args:
+        name: of the CSV file.
+        task: that was stepped.
+        steps: environment steps behind every measured time.
+        measured: CPU and wall seconds by contestant and round; ours are called ``nht``.
+    """
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout
-    with (Path(__file__).parent / "results" / "ppo_speed.csv").open("w", newline="") as file:
+    with (Path(__file__).parent / "results" / f"{name}.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         columns = ["contestant", "task", "round", "cpu_seconds", "wall_seconds", "commit", "cores", "torch"]
         writer.writerow(columns)
-        for name, values in measured.items():
+        for contestant, values in measured.items():
             for number, (cpu, wall) in enumerate(values):
                 machine = [commit.strip(), os.cpu_count(), torch.__version__]
-                writer.writerow([name, task, number, f"{cpu:.4f}", f"{wall:.4f}", *machine])
+                writer.writerow([contestant, task, number, f"{cpu:.4f}", f"{wall:.4f}", *machine])
             ratios = [cpu / ours for (cpu, _), (ours, _) in zip(values, measured["nht"], strict=True)]
-            rates = [STEPS / statistics.median(seconds) for seconds in zip(*values, strict=True)]
+            rates = [steps / statistics.median(seconds) for seconds in zip(*values, strict=True)]
             print(
-                f"{name:>8}  {rates[0]:7.0f} steps per CPU second  {rates[1]:7.0f} per second  "
+                f"{contestant:>8}  {rates[0]:7.0f} steps per CPU second  {rates[1]:7.0f} per second  "
                 f"{statistics.median(ratios):5.2f} x our CPU time ({min(ratios):.2f} .. {max(ratios):.2f})"
             )
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}")

@@ -1,16 +1,19 @@
 """What the recipes add to TorchRL's DDPG, against values worked out by hand."""
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from nht.envs import make_env
+from nht.recipes.config import DDPGConfig
 from nht.recipes.losses import PaperDDPGLoss, charge_failure, n_step_returns, return_range, reward_range
-from nht.recipes.networks import RunningNorm
+from nht.recipes.networks import RunningNorm, ddpg_networks
 
 GAMMA = 0.9
 
@@ -39,7 +42,8 @@ def batch(features, action, next_features, reward, terminated=False):
     column = {key: torch.tensor([[value]]) for key, value in [("features", features), ("action", action)]}
     outcome = {"features": torch.tensor([[next_features]]), "reward": torch.tensor([[reward]])}
     outcome |= {"done": flag, "terminated": flag.clone()}
-    return TensorDict({**column, "next": outcome}, batch_size=[1])
+    steps = {"steps_to_next_obs": torch.ones(1, dtype=torch.long)}
+    return TensorDict({**column, **steps, "next": outcome}, batch_size=[1])
 
 
 def test_target_is_reward_plus_discounted_target_value():
@@ -75,6 +79,36 @@ def test_actor_pays_for_large_actions_and_leaves_the_critic_alone():
     value.backward()
     gradients = {name: parameter.grad for name, parameter in module.named_parameters()}
     assert all((gradient is not None) == ("actor" in name) for name, gradient in gradients.items())
+
+
+def test_ddpg_loss_is_torchrls():
+    torch.manual_seed(0)
+    env = make_env("half_cheetah")
+    _, actor, critic = ddpg_networks(env, DDPGConfig(hidden=[32, 16]))
+    settings = {"delay_actor": True, "delay_value": True}
+    ours = PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=0.0, reward_range=(-math.inf, math.inf))
+    theirs = DDPGLoss(deepcopy(actor), deepcopy(critic), **settings)
+    theirs.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    updaters = [SoftUpdate(module, eps=0.5) for module in (ours, theirs)]
+    optimisers = [torch.optim.SGD(module.parameters(), lr=0.1) for module in (ours, theirs)]
+    for _ in range(3):
+        flags = torch.rand(2, 64, 1) < 0.3
+        outcome = {"features": torch.randn(64, 17), "reward": torch.randn(64, 1)}
+        outcome |= {"terminated": flags[0], "done": flags.any(0)}
+        columns = {"features": torch.randn(64, 17), "action": torch.rand(64, 6) - 0.5}
+        sample = TensorDict(
+            {**columns, "steps_to_next_obs": torch.randint(1, 5, (64,)), "next": outcome}, [64]
+        )
+        losses = [module(sample.clone()) for module in (ours, theirs)]
+        for key in ("loss_actor", "loss_value", "target_value"):
+            torch.testing.assert_close(losses[0][key], losses[1][key])
+        for loss, optimiser, updater in zip(losses, optimisers, updaters, strict=True):
+            (loss["loss_actor"] + loss["loss_value"]).backward()
+            optimiser.step()
+            optimiser.zero_grad()
+            updater.step()
+        weights, expected = ours.state_dict(), theirs.state_dict()
+        torch.testing.assert_close(dict(weights), {key: expected[key] for key in weights})
 
 
 def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
