@@ -187,10 +187,15 @@ class RunConfig:
     """Where a run writes, and whether it goes on from what it finds there."""
 
     folder: str = ""
-    resume: bool = False
+    resume: Any = False  # true, or auto: go on if the folder holds a run, else begin
     checkpoint_every: int = 50_000  # frames
     wandb: bool = True
     wandb_project: str = "nht"
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for another way to resume."""
+        if self.resume not in (True, False, "auto"):
+            raise ValueError(f"run.resume must be true, false or auto, got {self.resume!r}.")
 
 
 @dataclass

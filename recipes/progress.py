@@ -66,7 +66,7 @@ class TrainingStatistics:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
         self._updates += 1
         for name in self._losses:
-            self._sums[name] = self._sums[name] + losses[name].detach()
+            self._sums[name] = self._sums[name] + losses[name].detach().double()
 
     def add_steps(self, steps: TensorDictBase) -> None:
         """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations."""
@@ -78,6 +78,20 @@ class TrainingStatistics:
         for name in ("success", "failure"):
             self._sums[name] += float((outcome[name] & done).sum())
         self._sums["diverged"] += float(outcome["diverged"].sum())
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums so far."""
+        counts = {"updates": self._updates, "episodes": self._episodes, "steps": self._steps}
+        return {
+            "counts": counts,
+            "sums": {name: torch.as_tensor(total) for name, total in self._sums.items()},
+        }
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Go on adding to ``saved``."""
+        counts = saved["counts"]
+        self._updates, self._episodes, self._steps = counts["updates"], counts["episodes"], counts["steps"]
+        self._sums = defaultdict(float, saved.get("sums", {}))
 
     def take(self) -> dict[str, float]:
         """The means, starting anew; NaN where nothing was counted.

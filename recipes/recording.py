@@ -111,7 +111,7 @@ def record(
                 raise RuntimeError(
                     f"no episode in {len(steps) * len(length):,} steps had {' and '.join(wanted) or 'an end'}."
                 )
-    return _good_episodes(torch.stack(steps, dim=1))
+    return _good_episodes(torch.stack(steps, dim=1), demos.transitions)
 
 
 def _transition(
@@ -129,12 +129,19 @@ def _transition(
     return TensorDict(entries, batch_size=stepped.batch_size)
 
 
-def _good_episodes(steps: TensorDict) -> tuple[TensorDict, int]:
-    """From ``(N, T)`` steps, the transitions of the good episodes, and the number of others that ended."""
+def _good_episodes(steps: TensorDict, transitions: int) -> tuple[TensorDict, int]:
+    """From ``(N, T)`` steps the transitions of the good episodes, and the number of others that ended.
+
+    The first to end are taken, no more than it takes to have ``transitions``: copies that started together may all
+    end together.
+    """
     done, good = steps["done"].squeeze(-1), steps["good"]
     nth = done.cumsum(dim=1) - done.long()  # of the copy's episodes
     episode = nth + (nth.amax() + 1) * torch.arange(len(nth))[:, None]
-    kept = torch.isin(episode, episode[good])
+    first_to_end = episode.T[good.T]
+    lengths = torch.bincount(episode.flatten())[first_to_end]
+    enough = int((lengths.cumsum(0) < transitions).sum()) + 1
+    kept = torch.isin(episode, first_to_end[:enough])
     data = steps[kept].exclude("good")
     data["episode"] = episode[kept].unique_consecutive(return_inverse=True)[1]
     return data, int((done & ~good).sum())

@@ -18,6 +18,7 @@ from torchrl.record.loggers.wandb import WandbLogger
 from tqdm import tqdm
 
 from nht.recipes.config import DDPG, PPO, RunConfig, Training
+from nht.storage import replacing
 
 RECIPES: dict[str, type[Training]] = {"DDPG": DDPG, "PPO": PPO}
 """What ``config.yaml`` says of the algorithm, under ``recipe``; folders that say nothing hold DDPG."""
@@ -45,9 +46,13 @@ class RunFolder:
         config: the whole configuration of the run, a dataclass, saved as ``config.yaml``.
 
     Raises:
-        FileExistsError: if the folder holds a run already and ``run.resume`` is not set.
-        FileNotFoundError: if ``run.resume`` is set and there is nothing to resume.
+        FileExistsError: if the folder holds a run already and ``run.resume`` is false.
+        FileNotFoundError: if ``run.resume`` is true and there is nothing to resume.
         ValueError: if what is to be resumed is a run of another task, algorithm or network.
+
+    Attributes:
+        path: of the folder.
+        resuming: whether it holds a run already, which is to go on.
     """
 
     def __init__(self, run: RunConfig, config: Any) -> None:
@@ -55,18 +60,20 @@ class RunFolder:
         self._started = time.perf_counter()
         self.metrics = self.path / "metrics.csv"
         settings = self.path / "config.yaml"
-        if run.resume and not settings.exists():
+        self.resuming = settings.exists()
+        if run.resume is True and not self.resuming:
             raise FileNotFoundError(f"{self.path} holds no run to resume.")
-        if not run.resume and settings.exists():
+        if run.resume is False and self.resuming:
             raise FileExistsError(
                 f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
             )
         self.path.mkdir(parents=True, exist_ok=True)
         described = {"recipe": type(config).__name__, **asdict(config)}
-        if run.resume:
+        if self.resuming:
             self._check_same(yaml.safe_load(settings.read_text()), described)
         else:
-            settings.write_text(yaml.safe_dump(described, sort_keys=False))
+            with replacing(settings) as scratch:
+                scratch.write_text(yaml.safe_dump(described, sort_keys=False))
         self._wandb = self._start_wandb(run, config) if run.wandb else None
 
     def _check_same(self, saved: dict[str, Any], described: dict[str, Any]) -> None:
@@ -100,12 +107,14 @@ class RunFolder:
             self._wandb.experiment.log(row, step=frames)
 
     def rewind(self, frames: int) -> None:
-        """Drop the rows behind ``frames``: a resumed run writes them again."""
+        """Drop the rows behind ``frames``, or cut short by a kill: a resumed run writes them again."""
+        if not self.metrics.exists():
+            return
         with self.metrics.open(newline="") as file:
-            rows = list(csv.reader(file))
-        kept = [rows[0], *(row for row in rows[1:] if int(row[0]) <= frames)]
-        with self.metrics.open("w", newline="") as file:
-            csv.writer(file).writerows(kept)
+            heading, *rows = csv.reader(file)
+        kept = [row for row in rows if len(row) == len(heading) and int(row[0]) <= frames]
+        with replacing(self.metrics) as scratch, scratch.open("w", newline="") as file:
+            csv.writer(file).writerows([heading, *kept])
 
     def progress_bar(self, total: int, initial: int) -> tqdm[NoReturn]:
         """A bar over environment steps."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import signal
+import sys
+import threading
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector
 
+from nht.recipes.checkpoints import Checkpoints
 from nht.recipes.config import Training
 from nht.recipes.environments import mapped_env, run_map, test_env
 from nht.recipes.evaluation import Evaluation
@@ -47,10 +50,10 @@ class TrainingRun:
         self.tests = test_env(config, self._map, config.evaluation.episodes)
         self.counters = Counters()
         self._statistics = TrainingStatistics(self.env.base_env.action_spec.space, losses)
-        self._checkpoints = CheckpointRotation(self._folder.path / "checkpoints", keep_last=2)
+        self._stopping, self._before = False, None
 
     def start(self, collector: Collector, **parts: Any) -> None:
-        """Begin, or go on where the run stopped.
+        """Begin, or go on where the run stopped. From now on SIGTERM ends the run after a last checkpoint.
 
         Args:
             collector: of the training's batches.
@@ -61,22 +64,29 @@ class TrainingRun:
         """
         config: Training = self._config
         self._collector = collector
-        self._checkpoint = Checkpoint(
+        self._checkpoints = Checkpoints(
+            self._folder.path / "checkpoints",
             **parts,
             collector=CollectorState(collector),
             simulator=self.env.base_env.task,
             test_simulator=self.tests.base_env.task,
-            random=GlobalRNGState(),
             counters=self.counters,
+            statistics=self._statistics,
         )
-        if config.run.resume:
-            self._checkpoints.load_latest(self._checkpoint)
+        if self._folder.resuming:
+            if not self._checkpoints.load() and config.run.resume != "auto":
+                raise FileNotFoundError(f"{self._folder.path} holds no checkpoint to resume from.")
             self._folder.rewind(self.counters.frames)
         if self.finished:
             raise ValueError(
                 f"{self._folder.path} has made its {self.counters.frames} steps: raise algo.total_frames to go on."
             )
         self._progress = self._folder.progress_bar(config.algo.total_frames, self.counters.frames)
+        if threading.current_thread() is threading.main_thread():  # elsewhere Python knows no signals
+            self._before = signal.signal(signal.SIGTERM, self._stop)
+
+    def _stop(self, *_: Any) -> None:
+        self._stopping = True
 
     def count_steps(self, data: TensorDictBase) -> None:
         """Take collected steps ``(*batch,)`` into counters and statistics."""
@@ -105,10 +115,19 @@ class TrainingRun:
         self._progress.set_postfix(shown)
 
     def save_if_due(self) -> None:
-        """Write a checkpoint, now and then."""
+        """Write a checkpoint, now and then.
+
+        Raises:
+            OSError: if there is no room; earlier checkpoints stay as they are.
+            SystemExit: after the last one, if the process was told to end.
+        """
         config: Training = self._config
-        if self.counters.frames % config.run.checkpoint_every == 0:
-            self._checkpoints.save(self._checkpoint, step=self.counters.frames)
+        if self._stopping or self.counters.frames % config.run.checkpoint_every == 0:
+            self._checkpoints.save(self.counters.frames)
+        if self._stopping:
+            self._progress.close()
+            print(f"{self._folder.path} was told to end: go on with run.resume=true.")
+            sys.exit(128 + signal.SIGTERM)
 
     @property
     def finished(self) -> bool:
@@ -119,6 +138,8 @@ class TrainingRun:
     def finish(self, policy: TensorDictModule) -> None:
         """Save and film the policy, close everything, and say what happened."""
         config: Training = self._config
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
         self._collector.shutdown()
         self.tests.close()
         self._progress.close()

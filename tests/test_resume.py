@@ -1,0 +1,193 @@
+"""Stopped in any way, a run goes on exactly as if it had not been: killed, told to end, out of room, broken files."""
+
+import errno
+import os
+import shutil
+import signal
+import zipfile
+from pathlib import Path
+
+import pandas
+import pytest
+from torchrl.checkpoint import Checkpoint
+
+import fresh_process
+from nht.recipes import ddpg, ppo
+from nht.recipes.config import DDPG, PPO, RunConfig
+from nht.recipes.launch import configure
+from nht.recipes.run_folder import RunFolder
+from nht.recipes.training import TrainingRun
+
+SHARED = [
+    "env=wam_wipe",
+    "map=none",
+    "env.num_envs=4",
+    "env.options.max_episode_steps=25",
+    "algo.total_frames=600",
+    "algo.frames_per_batch=100",
+    "algo.hidden=[16,16]",
+    "evaluation.every=300",
+    "evaluation.episodes=3",
+    "evaluation.video=false",
+    "run.checkpoint_every=200",
+    "run.wandb=false",
+]
+OWN = {
+    "ddpg": ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"],
+    "ppo": ["algo.minibatches=4", "algo.epochs=2"],
+}
+
+
+def train(algorithm: str, folder: Path, *overrides: str) -> pandas.DataFrame:
+    main, schema = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}[algorithm]
+    main(configure(schema, algorithm, [*SHARED, *OWN[algorithm], f"run.folder={folder}", *overrides]))
+    return pandas.read_csv(folder / "metrics.csv").drop(columns="seconds")
+
+
+@pytest.fixture(scope="module", params=["ddpg", "ppo"])
+def whole(request, tmp_path_factory):
+    """The algorithm, and a run that nothing stopped: its folder and metrics."""
+    folder = tmp_path_factory.mktemp(request.param) / "whole"
+    return request.param, folder, train(request.param, folder)
+
+
+def assert_same(folder: Path, metrics: pandas.DataFrame, whole) -> None:
+    pandas.testing.assert_frame_equal(metrics, whole[2])
+    weights = [(path / "policy.safetensors").read_bytes() for path in (folder, whole[1])]
+    assert weights[0] == weights[1]
+
+
+def train_and_be_killed(algorithm: str, folder: Path, checkpoint: int) -> None:
+    """Train, and be killed at the moment when a checkpoint is written but not yet in its place."""
+    publish, written = Checkpoint._publish_path, []
+
+    def kill(*paths):
+        written.append(paths)
+        if len(written) == checkpoint:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return publish(*paths)
+
+    Checkpoint._publish_path = staticmethod(kill)
+    train(algorithm, folder)
+
+
+@pytest.mark.parametrize("checkpoint", [1, 2])
+def test_killed_while_writing_a_checkpoint(whole, checkpoint, tmp_path):
+    here, folder = Path(__file__).parent, tmp_path / "run"
+    code = f"import sys; sys.path.insert(0, {str(here)!r}); import test_resume; from pathlib import Path; "
+    code += f"test_resume.train_and_be_killed({whole[0]!r}, Path({str(folder)!r}), {checkpoint})"
+    process = fresh_process.run(code)
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    checkpoints = tmp_path / "run" / "checkpoints"
+    assert len(list(checkpoints.glob("checkpoint-*"))) == checkpoint - 1
+    assert list(checkpoints.glob(".*"))
+    metrics = train(whole[0], tmp_path / "run", "run.resume=auto")
+    assert_same(tmp_path / "run", metrics, whole)
+    assert not list(checkpoints.glob(".*"))
+
+
+def test_told_to_end_between_two_evaluations(whole, tmp_path, monkeypatch, capsys):
+    before, count = signal.getsignal(signal.SIGTERM), TrainingRun.count_steps
+
+    def tell(self, data):
+        count(self, data)
+        if self.counters.frames == 500:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(TrainingRun, "count_steps", tell)
+        with pytest.raises(SystemExit) as stopped:
+            train(whole[0], tmp_path / "run")
+    signal.signal(signal.SIGTERM, before)
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert "was told to end: go on with run.resume=true" in capsys.readouterr().out
+    assert (tmp_path / "run" / "checkpoints" / "checkpoint-000000000500.torchrl").exists()
+    assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
+
+
+def broken_off(whole, folder: Path) -> list[Path]:
+    """A run that broke off a moment before its end; its checkpoints, oldest first."""
+    log = RunFolder.log
+
+    def break_off(self, frames, row):
+        if frames == 600:
+            raise KeyboardInterrupt
+        log(self, frames, row)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(RunFolder, "log", break_off)
+        with pytest.raises(KeyboardInterrupt):
+            train(whole[0], folder)
+    return sorted((folder / "checkpoints").glob("checkpoint-*"))
+
+
+def cut_short(checkpoint: Path) -> None:
+    os.truncate(checkpoint, checkpoint.stat().st_size // 2)
+
+
+def flip_a_bit(checkpoint: Path) -> None:
+    with zipfile.ZipFile(checkpoint) as archive:
+        largest = max(archive.infolist(), key=lambda entry: entry.file_size)
+    content = bytearray(checkpoint.read_bytes())
+    content[largest.header_offset + largest.file_size // 2] ^= 1
+    checkpoint.write_bytes(content)
+
+
+@pytest.mark.parametrize("damage", [cut_short, flip_a_bit])
+def test_a_broken_checkpoint_is_passed_over(whole, damage, tmp_path):
+    _, newest = broken_off(whole, tmp_path / "run")
+    damage(newest)
+    with pytest.warns(UserWarning, match=rf"{newest} cannot be read and is passed over"):
+        metrics = train(whole[0], tmp_path / "run", "run.resume=true")
+    assert_same(tmp_path / "run", metrics, whole)
+
+
+def test_nothing_but_broken_checkpoints(whole, tmp_path):
+    for checkpoint in broken_off(whole, tmp_path / "run"):
+        cut_short(checkpoint)
+    with (
+        pytest.warns(UserWarning, match="cannot be read"),
+        pytest.raises(ValueError, match=r"none of the checkpoints in .* can be read"),
+    ):
+        train(whole[0], tmp_path / "run", "run.resume=true")
+
+
+def test_a_row_cut_short_is_written_again(whole, tmp_path):
+    broken_off(whole, tmp_path / "run")
+    with (tmp_path / "run" / "metrics.csv").open("a") as file:
+        file.write("30")  # of 300,0.0,...
+    assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
+
+
+@pytest.mark.parametrize("warned", [True, False])
+def test_a_full_disk(whole, tmp_path, monkeypatch, warned):
+    broken_off(whole, tmp_path / "run")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        if warned:
+            room = shutil.disk_usage(tmp_path)._replace(free=1000)
+            patched.setattr(shutil, "disk_usage", lambda _: room)
+            reason = r"the last one is of [\d.]+ MB, only 0.0 MB are left for the next"
+        else:
+            patched.setattr(Checkpoint, "_publish_path", full)
+            reason = "No space left on device"
+        match = rf"no checkpoint after 600 steps: {reason}. The last one is .*checkpoint-000000000400"
+        with pytest.raises(OSError, match=match):
+            train(whole[0], tmp_path / "run", "run.resume=true")
+    assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
+
+
+def test_a_run_without_a_checkpoint_cannot_go_on_but_begin_anew(whole, tmp_path):
+    broken_off(whole, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    with pytest.raises(FileNotFoundError, match="holds no checkpoint to resume from"):
+        train(whole[0], tmp_path / "run", "run.resume=true")
+    assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=auto"), whole)
+
+
+def test_ways_to_resume():
+    with pytest.raises(ValueError, match=r"run\.resume must be true, false or auto, got 'yes'"):
+        RunConfig(resume="yes")
