@@ -90,7 +90,7 @@ def record_policy(
         "min_return": demos.min_return,
         "left_out_episodes": left_out,
     }
-    expert = f"{trained.map.kind} policy"
+    expert = "raw policy" if trained.map.kind == "none" else f"{trained.map.kind} policy"
     return nht.save_demos(data, path, env=env.name, seed=seed, expert=expert, settings=settings)
 
 

@@ -22,6 +22,7 @@ from torch.func import jacfwd, vmap
 
 import nht
 
+LONGEST = 250  # steps of a demonstration that can still be told apart
 GRID = 9  # arrows along the longer side of the area where the tool was
 STEEP = Normalize(-0.1, 0.1)  # the vertical share of a motion within which its colour changes
 SLOPES = LinearSegmentedColormap.from_list("slopes", ["#1a73e8", "#202020", "#e8331a"])
@@ -31,7 +32,8 @@ SLOPES = LinearSegmentedColormap.from_list("slopes", ["#1a73e8", "#202020", "#e8
 def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: int, path: str | Path) -> None:
     """The bases of maps along a demonstration: beside each other the maps, below each other their columns.
 
-    A panel has a line for each motor. What stands for the basis of a map that is not linear is said at `local_basis`.
+    A panel has a line for each motor; of a long demonstration it shows the first steps. What stands for the basis of
+    a map that is not linear is said at `local_basis`.
 
     Args:
         maps: trained maps, by the name to show.
@@ -42,8 +44,8 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
     Raises:
         ValueError: if there is no such episode, or a map is not trained.
     """
-    rows = demos.episode == episode
-    if not rows.any():
+    rows = (demos.episode == episode).nonzero().flatten()[:LONGEST]
+    if not len(rows):
         raise ValueError(f"there is no episode {episode}: the last is {int(demos.episode.max())}")
     actuation = demos.actuation[rows]
     axes = max(map.action_dim for map in maps.values())
