@@ -61,19 +61,20 @@ def _read_run(metrics: Path) -> pandas.DataFrame:
 
 
 def summarise(curves: pandas.DataFrame, metric: str = "success") -> pandas.DataFrame:
-    """Per interface: seeds, steps, and the mean and interquartile mean over seeds of the last evaluation.
+    """Per interface: seeds, steps, and the mean and interquartile mean over seeds of the last evaluation of all.
 
     For success also the failures, and the median of the steps to a success of 0.9.
     """
     rows = []
     shown = "{:.3f}" if metric == "success" else "{:,.0f}"
     for interface, group in curves.groupby("interface", sort=False):
-        last = group[group["frames"] == group["frames"].max()]
+        together = reached_by_all(group)
+        last = together[together["frames"] == together["frames"].max()]
         scores = last[f"eval_{metric}"].to_numpy()
         row = {
             "interface": interface,
             "seeds": group["seed"].nunique(),
-            "steps": int(group["frames"].max()),
+            "steps": int(together["frames"].max()),
             metric: shown.format(scores.mean()),
             "95 %": " .. ".join(map(shown.format, interval(scores))),
             "IQM": shown.format(interquartile_mean(scores)),
@@ -83,9 +84,17 @@ def summarise(curves: pandas.DataFrame, metric: str = "success") -> pandas.DataF
             reached = group[group["eval_success"] >= 0.9].groupby("seed")["frames"].min()
             every = len(reached) == group["seed"].nunique()
             row["failure"] = f"{last['eval_failure'].mean():.3f}"
-            row["steps to 0.9"] = f"{int(reached.median()):,}" if every else f"{len(reached)} seeds got there"
+            row["steps to 0.9"] = (
+                f"{int(reached.median()):,}" if every else f"{len(reached)} of {row['seeds']} seeds"
+            )
         rows.append(row | {"minutes": f"{last['seconds'].mean() / 60:.1f}"})
     return pandas.DataFrame(rows)
+
+
+def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
+    """The evaluations of one interface that every one of its seeds has made: some runs may have gone on for longer."""
+    seeds = group.groupby("frames")["seed"].transform("nunique")
+    return group[seeds == group["seed"].nunique()]
 
 
 def interquartile_mean(scores: NDArray[np.float64], axis: int = 0) -> NDArray[np.float64]:
@@ -121,7 +130,7 @@ def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path) -> None:
     """Mean over the seeds of every interface, with its interval, against environment steps."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for interface, group in curves.groupby("interface", sort=False):
-        by_frames = group.groupby("frames")[f"eval_{metric}"]
+        by_frames = reached_by_all(group).groupby("frames")[f"eval_{metric}"]
         frames = np.array(list(by_frames.groups))
         bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
         seeds = group["seed"].nunique()

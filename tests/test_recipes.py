@@ -178,6 +178,15 @@ def test_report_compares_the_runs_below_a_folder(run, map_file, tmp_path):
     assert iio.imread(out / "success.png").ndim == 3
 
 
+def test_report_stops_where_a_seed_does():
+    rows = [(0, 10, 0.2), (0, 20, 0.4), (0, 30, 1.0), (1, 10, 0.4), (1, 20, 0.6)]
+    curves = pandas.DataFrame(rows, columns=["seed", "frames", "eval_success"])
+    curves = curves.assign(interface="nht", eval_failure=0.0, eval_return=0.0, seconds=60.0)
+    (row,) = report.summarise(curves).to_dict("records")
+    assert (row["seeds"], row["steps"], row["success"]) == (2, 20, "0.500")
+    assert row["steps to 0.9"] == "1 of 2 seeds"
+
+
 def test_report_of_returns(run, tmp_path):
     folder, metrics = run
     out = tmp_path / "report"
