@@ -97,7 +97,7 @@ class WAMTask(BatchedTask):
         self.failed |= self._violates()
         success = self._at_goal() & ~self.failed
         ended = (self.failed & self.terminate_on_failure) | (success & self.terminate_on_success)
-        return success - 1.0, ended, success, self.failed.copy()
+        return np.where(success, 0.0, -1.0), ended, success, self.failed.copy()
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Go on from what ``state_dict`` returned."""

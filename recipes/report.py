@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -71,9 +72,10 @@ def summarise(curves: pandas.DataFrame, metric: str = "success") -> pandas.DataF
         together = reached_by_all(group)
         last = together[together["frames"] == together["frames"].max()]
         scores = last[f"eval_{metric}"].to_numpy()
+        seeds = group["seed"].nunique()
         row = {
             "interface": interface,
-            "seeds": group["seed"].nunique(),
+            "seeds": seeds,
             "steps": int(together["frames"].max()),
             metric: shown.format(scores.mean()),
             "95 %": " .. ".join(map(shown.format, interval(scores))),
@@ -82,10 +84,10 @@ def summarise(curves: pandas.DataFrame, metric: str = "success") -> pandas.DataF
         }
         if metric == "success":
             reached = group[group["eval_success"] >= 0.9].groupby("seed")["frames"].min()
-            every = len(reached) == group["seed"].nunique()
             row["failure"] = f"{last['eval_failure'].mean():.3f}"
+            all_there = len(reached) == seeds
             row["steps to 0.9"] = (
-                f"{int(reached.median()):,}" if every else f"{len(reached)} of {row['seeds']} seeds"
+                f"{int(reached.median()):,}" if all_there else f"{len(reached)} of {seeds} seeds"
             )
         rows.append(row | {"minutes": f"{last['seconds'].mean() / 60:.1f}"})
     return pandas.DataFrame(rows)
@@ -97,14 +99,12 @@ def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
     return group[seeds == group["seed"].nunique()]
 
 
-def interquartile_mean(scores: NDArray[np.float64], axis: int = 0) -> NDArray[np.float64]:
+def interquartile_mean(scores: NDArray[np.float64], axis: int = 0) -> NDArray[np.float64] | np.float64:
     """The mean of the middle half of the scores."""
     return stats.trim_mean(scores, 0.25, axis=axis)
 
 
-def interval(
-    scores: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]] = np.mean
-) -> tuple[float, float]:
+def interval(scores: NDArray[np.float64], statistic: Callable[..., Any] = np.mean) -> tuple[float, float]:
     """Bootstrap interval of a statistic over seeds (percentiles, a generator of its own); a point for one seed."""
     if len(scores) < 2 or np.ptp(scores) == 0:
         return float(scores.mean()), float(scores.mean())

@@ -50,7 +50,8 @@ class TrainingRun:
         self.tests = test_env(config, self._map, config.evaluation.episodes)
         self.counters = Counters()
         self._statistics = TrainingStatistics(self.env.base_env.action_spec.space, losses)
-        self._stopping, self._before = False, None
+        self._stopping = False
+        self._before: Any = None  # what SIGTERM did before this run
 
     def start(self, collector: Collector, **parts: Any) -> None:
         """Begin, or go on where the run stopped. From now on SIGTERM ends the run after a last checkpoint.
@@ -87,6 +88,7 @@ class TrainingRun:
 
     def _stop(self, *_: Any) -> None:
         self._stopping = True
+        signal.signal(signal.SIGTERM, self._before)  # the second one acts at once
 
     def count_steps(self, data: TensorDictBase) -> None:
         """Take collected steps ``(*batch,)`` into counters and statistics."""
@@ -124,7 +126,7 @@ class TrainingRun:
         config: Training = self._config
         if self._stopping or self.counters.frames % config.run.checkpoint_every == 0:
             self._checkpoints.save(self.counters.frames)
-        if self._stopping:
+        if self._stopping and not self.finished:
             self._progress.close()
             print(f"{self._folder.path} was told to end: go on with run.resume=true.")
             sys.exit(128 + signal.SIGTERM)

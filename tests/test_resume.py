@@ -98,7 +98,7 @@ def test_told_to_end_between_two_evaluations(whole, tmp_path, monkeypatch, capsy
         patched.setattr(TrainingRun, "count_steps", tell)
         with pytest.raises(SystemExit) as stopped:
             train(whole[0], tmp_path / "run")
-    signal.signal(signal.SIGTERM, before)
+    assert signal.getsignal(signal.SIGTERM) == before
     assert stopped.value.code == 128 + signal.SIGTERM
     assert "was told to end: go on with run.resume=true" in capsys.readouterr().out
     assert (tmp_path / "run" / "checkpoints" / "checkpoint-000000000500.torchrl").exists()
