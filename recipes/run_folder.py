@@ -111,10 +111,13 @@ class RunFolder:
         if not self.metrics.exists():
             return
         with self.metrics.open(newline="") as file:
-            heading, *rows = csv.reader(file)
-        kept = [row for row in rows if len(row) == len(heading) and int(row[0]) <= frames]
+            rows = list(csv.reader(file))
+        kept = [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= frames]
+        if not kept:
+            self.metrics.unlink()  # its heading may be cut short, too
+            return
         with replacing(self.metrics) as scratch, scratch.open("w", newline="") as file:
-            csv.writer(file).writerows([heading, *kept])
+            csv.writer(file).writerows([rows[0], *kept])
 
     def progress_bar(self, total: int, initial: int) -> tqdm[NoReturn]:
         """A bar over environment steps."""

@@ -183,6 +183,7 @@ def test_a_full_disk(whole, tmp_path, monkeypatch, warned):
 def test_a_run_without_a_checkpoint_cannot_go_on_but_begin_anew(whole, tmp_path):
     broken_off(whole, tmp_path / "run")
     shutil.rmtree(tmp_path / "run" / "checkpoints")
+    (tmp_path / "run" / "metrics.csv").write_text("frames,tra")
     with pytest.raises(FileNotFoundError, match="holds no checkpoint to resume from"):
         train(whole[0], tmp_path / "run", "run.resume=true")
     assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=auto"), whole)
