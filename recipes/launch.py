@@ -43,8 +43,19 @@ def _keyed(word: str, positional: str) -> str:
     """A word of the command line as a Hydra override; quoted, for a path may hold any character."""
     if "=" in word or word.startswith("-"):
         return word
-    escaped = word.replace("'", r"\'")
-    return f"{positional}='{escaped}'"
+    return f"{positional}={_quoted(word)}"
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("'", r"\'")
+    return f"'{escaped}'"
+
+
+def _as_text(schema: type[Any], word: str) -> str:
+    """An override with its value quoted if it is text, as titles and paths are: these may hold commas and the like."""
+    key, _, value = word.partition("=")
+    is_text = any(entry.name == key and entry.type == "str" for entry in fields(schema))
+    return word if not is_text or value[:1] in ("'", '"') else f"{key}={_quoted(value)}"
 
 
 def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) -> Config:
@@ -64,7 +75,8 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
             "Hydra's multirun (-m) is not supported: start one process for each run."
         )
     try:
-        return cast(Config, OmegaConf.to_object(_compose(schema, name, overrides)))
+        texts = [_as_text(schema, word) for word in overrides]
+        return cast(Config, OmegaConf.to_object(_compose(schema, name, texts)))
     except (HydraException, OmegaConfBaseException) as error:
         reason = str(error.__cause__ or error).splitlines()[0]
         raise ValueError(f"{str(error).splitlines()[0]} ({reason}){_existing(schema, error)}") from error

@@ -63,6 +63,14 @@ def test_a_word_without_a_key_sets_the_positional_setting(path, monkeypatch):
     assert told == [InspectDemos(demos=path, directions=3)]
 
 
+@pytest.mark.parametrize(
+    "title", ["k = 3", "start fixed, k=2", "it's 5 {%}", "a 'b' [c]: d", "null", "", "7"]
+)
+def test_text_is_taken_as_it_is(title):
+    assert configure(Report, "report", [f"title={title}"]).title == title
+    assert configure(Report, "report", ["title='quoted, too'"]).title == "quoted, too"
+
+
 def test_dictionaries_take_new_keys_and_nothing_else_does():
     config = configure(
         CollectDemos, "collect_demos", ["source.context={joint: info/joint}", "env.options.new=1"]
