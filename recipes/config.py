@@ -86,6 +86,7 @@ class DDPGConfig(AlgoConfig):
 
     updates_per_batch: int = 20
     warmup_frames: int = 2_000  # collected before the first update
+    random_frames: int = 0  # the first ones, whose actions are uniform
     batch_size: int = 256
     buffer_size: int = 1_000_000
     hidden: list[int] = field(default_factory=lambda: [256, 256])
@@ -115,7 +116,7 @@ class DDPGConfig(AlgoConfig):
         for name in (*counts, "target_update_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"algo.{name} must be at least 1, got {getattr(self, name)}.")
-        for name in ("action_l2", "exploration_noise", "updates_per_batch", "warmup_frames"):
+        for name in ("action_l2", "exploration_noise", "updates_per_batch", "warmup_frames", "random_frames"):
             if getattr(self, name) < 0:
                 raise ValueError(f"algo.{name} must not be negative, got {getattr(self, name)}.")
         if self.noise_memory < 1:

@@ -55,6 +55,7 @@ def main(config: DDPG) -> None:
         exploring(policy, run.env, algo),
         frames_per_batch=algo.frames_per_batch,
         total_frames=-1,
+        init_random_frames=algo.random_frames,
         track_traj_ids=False,
         auto_register_policy_transforms=True,
     )

@@ -37,12 +37,13 @@ class CollectorState:
         self._collector = collector
 
     def state_dict(self) -> dict[str, Any]:
-        """Every entry that the next step starts from."""
-        return self._collector._carrier.to_dict()
+        """Every entry that the next step starts from, and how many steps were made: the first may be random ones."""
+        return {"carrier": self._collector._carrier.to_dict(), "frames": self._collector._frames}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Start the next step from ``saved``."""
-        self._collector._carrier.update(saved)
+        self._collector._carrier.update(saved["carrier"])
+        self._collector._frames = saved["frames"]
 
 
 class TrainingStatistics:
