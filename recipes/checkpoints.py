@@ -10,8 +10,8 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
-BROKEN = (zipfile.BadZipFile, OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError)
-"""What reading files that are missing, cut short or not what they should be can raise."""
+PREFIX = "checkpoint-"
+"""Of a checkpoint's name; the number of steps follows."""
 
 
 class Checkpoints:
@@ -52,25 +52,37 @@ class Checkpoints:
                 f"the last one is of {size / 1e6:.1f} MB, only {free / 1e6:.1f} MB are left for the next"
             )
 
-    def load(self) -> bool:
-        """Go on from the newest checkpoint that can be read; false if there is none at all.
+    def steps(self) -> list[int]:
+        """The steps after which checkpoints were written that can be read, oldest first.
 
-        What a kill in the middle of writing left behind is removed.
+        Others are passed over with a warning, and what a kill in the middle of writing left behind is removed.
 
         Raises:
             ValueError: if there are checkpoints, but none that can be read.
         """
         for unfinished in self._folder.glob(".*"):
             shutil.rmtree(unfinished) if unfinished.is_dir() else unfinished.unlink()
-        reason = None
-        for path in sorted(self._folder.glob("checkpoint-*"), reverse=True):
-            try:
-                self._checkpoint.load(path)
-            except BROKEN as error:
-                warnings.warn(f"{path} cannot be read and is passed over: {error}", stacklevel=2)
-                reason = reason or error
-            else:
-                return True
-        if reason is not None:
-            raise ValueError(f"none of the checkpoints in {self._folder} can be read.") from reason
-        return False
+        found = {int(path.stem.removeprefix(PREFIX)): path for path in self._folder.glob(f"{PREFIX}*")}
+        readable = [step for step, path in sorted(found.items()) if _is_whole(path)]
+        if found and not readable:
+            raise ValueError(f"none of the checkpoints in {self._folder} can be read.")
+        return readable
+
+    def load(self, step: int) -> None:
+        """Go on from the checkpoint after ``step`` steps, one of ``steps()``."""
+        (path,) = (
+            path for path in self._folder.glob(f"{PREFIX}*") if int(path.stem.removeprefix(PREFIX)) == step
+        )
+        self._checkpoint.load(path)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether all of an archive is what was written; says so if not."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, OSError) as error:
+        damaged = str(error)
+    if damaged is not None:
+        warnings.warn(f"{path} cannot be read and is passed over: {damaged}", stacklevel=3)
+    return damaged is None

@@ -175,6 +175,26 @@ class PPOConfig(AlgoConfig):
 
 
 @dataclass
+class CollectorConfig:
+    """Which processes step the copies."""
+
+    kind: str = "single"  # this one; or multi_sync, multi_async: workers beside it
+    num_workers: int = 1  # of each learner, which share its copies
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an unknown kind, or a number of workers that does not go with it."""
+        if self.kind not in ("single", "multi_sync", "multi_async"):
+            raise ValueError(f"collector.kind must be single, multi_sync or multi_async, got {self.kind!r}.")
+        if self.num_workers < 1:
+            raise ValueError(f"collector.num_workers must be at least 1, got {self.num_workers}.")
+        if self.kind == "single" and self.num_workers != 1:
+            raise ValueError(
+                f"collector=single has no workers, got collector.num_workers={self.num_workers}: "
+                "choose collector=multi_sync or multi_async."
+            )
+
+
+@dataclass
 class EvaluationConfig:
     """Deterministic episodes on environments and seeds of their own."""
 
@@ -245,6 +265,7 @@ class Training:
     demos: DemosConfig = field(default_factory=DemosConfig)
     map: MapConfig = field(default_factory=MapConfig)
     algo: AlgoConfig = field(default_factory=AlgoConfig)
+    collector: CollectorConfig = field(default_factory=CollectorConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
     seed: int = 0
@@ -260,6 +281,11 @@ class Training:
                 raise ValueError(
                     f"{name} must be a multiple of algo.frames_per_batch={self.algo.frames_per_batch}, got {value}."
                 )
+        if self.env.num_envs % self.collector.num_workers:
+            raise ValueError(
+                f"env.num_envs={self.env.num_envs} must be a multiple of "
+                f"collector.num_workers={self.collector.num_workers}: every worker steps as many copies."
+            )
         if self.algo.frames_per_batch % self.env.num_envs:
             raise ValueError(
                 f"algo.frames_per_batch={self.algo.frames_per_batch} must be a multiple of "

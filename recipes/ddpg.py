@@ -6,8 +6,8 @@ python -m nht.recipes.ddpg env=wam_wipe map=nht seed=0
 from __future__ import annotations
 
 import torch
-from tensordict.nn import TensorDictSequential
-from torchrl.collectors import Collector
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
@@ -16,6 +16,7 @@ from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
 from nht.recipes.losses import PaperDDPGLoss, charge_failure, n_step_returns, reward_range
 from nht.recipes.networks import ddpg_networks, exploring
+from nht.recipes.ranks import Ranks
 from nht.recipes.training import TrainingRun
 
 STORED = (
@@ -48,43 +49,45 @@ def main(config: DDPG) -> None:
         fused=True,
     )
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(algo.buffer_size, device=config.device), batch_size=algo.batch_size
+        storage=LazyTensorStorage(run.ranks.share("algo.buffer_size", algo.buffer_size), device=run.device),
+        batch_size=run.ranks.share("algo.batch_size", algo.batch_size),
     )
-    collector = Collector(
-        run.env,
-        exploring(policy, run.env, algo),
-        frames_per_batch=algo.frames_per_batch,
-        total_frames=-1,
-        init_random_frames=algo.random_frames,
-        track_traj_ids=False,
-        auto_register_policy_transforms=True,
-    )
-    run.start(collector, loss=loss, optimiser=optimiser, features=features, buffer=buffer)
+    collector = run.collector(exploring(policy, run.env, algo), random_frames=algo.random_frames)
 
-    for data in collector:
-        run.count_steps(data)
-        features.module.update(data["observation"])
-        data = look_ahead(charge_failure(data, algo.gamma, rewards)).reshape(-1)
-        buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
+    with run.training(collector, loss, optimiser=optimiser, features=features, buffer=buffer) as batches:
+        for data in batches:
+            run.count_steps(data)
+            features.module.update(data["observation"], run.ranks.sum)
+            data = look_ahead(charge_failure(data, algo.gamma, rewards)).reshape(-1)
+            buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
 
-        for _ in range(algo.updates_per_batch if run.counters.frames >= algo.warmup_frames else 0):
-            batch = buffer.sample().to(config.device)
-            with torch.no_grad():
-                features(batch), features(batch["next"])
-            losses = loss(batch)
-            (losses["loss_actor"] + losses["loss_value"]).backward()
-            optimiser.step()
-            optimiser.zero_grad()
-            run.count_update(losses)
-            if run.counters.updates % algo.target_update_every == 0:
-                target.step()
+            for _ in range(algo.updates_per_batch if run.counters.frames >= algo.warmup_frames else 0):
+                losses = descend(buffer.sample().to(run.device), features, loss, optimiser, run.ranks)
+                run.count_update(losses)
+                if run.counters.updates % algo.target_update_every == 0:
+                    target.step()
 
-        if run.evaluation_due:
-            run.log(evaluate(run.tests, policy))
-        run.save_if_due()
-        if run.finished:
-            break
+            if run.evaluation_due:
+                run.log(evaluate(run.tests, policy))
     run.finish(policy)
+
+
+def descend(
+    batch: TensorDictBase,
+    features: TensorDictModule,
+    loss: PaperDDPGLoss,
+    optimiser: torch.optim.Optimizer,
+    ranks: Ranks,
+) -> TensorDictBase:
+    """One gradient step of actor and critic, on the batches ``(B,)`` of all ranks as if they were one; the losses."""
+    with torch.no_grad():
+        features(batch), features(batch["next"])
+    losses = loss(batch)
+    (losses["loss_actor"] + losses["loss_value"]).backward()
+    ranks.average_gradients(loss.parameters())
+    optimiser.step()
+    optimiser.zero_grad()
+    return losses
 
 
 if __name__ == "__main__":

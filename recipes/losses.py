@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import deepcopy
 from typing import ClassVar
 
@@ -126,6 +127,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         clip_value: whether the critic is held within ``clip`` of its old values, too.
         critic_coeff: weight of the critic's mean squared error.
         entropy_coeff: weight of the entropy.
+        add: adds up tensors of all processes that share a minibatch; alone, there is nothing to add.
     """
 
     reports: ClassVar[tuple[str, ...]] = (
@@ -145,6 +147,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         clip_value: bool,
         critic_coeff: float,
         entropy_coeff: float,
+        add: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__(
             actor,
@@ -159,6 +162,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         )
         self._clip, self._clips_value = clip, clip_value
         self._critic_weight, self._entropy_weight = critic_coeff, entropy_coeff
+        self._add = add
 
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
         """The ``"loss"`` to descend on, a scalar, and the ``reports``, for a minibatch ``(B,)``."""
@@ -167,14 +171,22 @@ class GaussianPPOLoss(ClipPPOLoss):
         log_ratio = log_prob - batch["sample_log_prob"]
         ratio = log_ratio.exp()
         clipped = ratio.clamp(1.0 - self._clip, 1.0 + self._clip)
-        advantage = batch["advantage"].squeeze(-1)
-        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+        advantage = self._normalised(batch["advantage"].squeeze(-1))
         objective = -torch.minimum(ratio * advantage, clipped * advantage).mean()
         critic = self._critic_weight * self._squared_error(self.critic_network.module(features), batch)
         loss = objective + critic - self._entropy_weight * entropy
         with torch.no_grad():
             reports = (objective, critic, entropy, (clipped != ratio).float().mean(), -log_ratio.mean())
         return TensorDict({"loss": loss} | dict(zip(self.reports, reports, strict=True)))
+
+    def _normalised(self, advantage: Tensor) -> Tensor:
+        """Advantages ``(B,)`` with mean 0 and deviation 1 over the minibatch, other processes' parts of it included."""
+        if self._add is None:
+            return (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+        count, total = self._add(torch.stack([torch.ones_like(advantage), advantage]).sum(1))
+        advantage = advantage - total / count
+        variance = self._add(advantage.square().sum()) / (count - 1)
+        return advantage / variance.sqrt().clamp_min(1e-6)
 
     def _squared_error(self, value: Tensor, batch: TensorDictBase) -> Tensor:
         target = batch["value_target"]

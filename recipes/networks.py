@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -16,6 +17,14 @@ from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
 
 from nht.recipes.config import AlgoConfig, DDPGConfig, PPOConfig
 from nht.recipes.losses import return_range, reward_range
+
+Reduction = Callable[[Tensor], Tensor]
+"""Adds up a tensor over processes."""
+
+
+def alone(values: Tensor) -> Tensor:
+    """The sum over one process."""
+    return values
 
 
 class RunningNorm(nn.Module):
@@ -46,14 +55,20 @@ class RunningNorm(nn.Module):
         self.register_buffer("scale", torch.ones(size))
 
     @torch.no_grad()
-    def update(self, observation: Tensor) -> None:
-        """Take ``(*batch, size)`` observations into the statistics (Chan et al.'s pairwise update)."""
-        rows = observation.reshape(-1, observation.shape[-1]).double()
-        deviation = rows.mean(0) - self.mean
-        total = self.count + len(rows)
-        self.squares += rows.var(0, correction=0) * len(rows) + deviation**2 * self.count * len(rows) / total
-        self.mean += deviation * len(rows) / total
-        self.count.copy_(total)
+    def update(self, observation: Tensor, add: Reduction = alone) -> None:
+        """Take ``(*batch, size)`` observations into the statistics (Chan et al.'s pairwise update).
+
+        Args:
+            observation: of this process.
+            add: adds up tensors of all processes that share the statistics, which then stay the same in all of them.
+        """
+        rows = observation.reshape(-1, observation.shape[-1]).double() - self.mean
+        count, first, second = add(torch.stack([torch.ones_like(rows), rows, rows.square()]).sum(1))
+        deviation = first / count
+        total = self.count + count
+        self.squares += second - count * deviation**2 + deviation**2 * self.count * count / total
+        self.mean += deviation * count / total
+        self.count.copy_(total[0])
         self.shift.copy_(self.mean)
         self.scale.copy_((self.squares / total).sqrt().clamp_min(self.floor))
 
@@ -82,15 +97,23 @@ class ReturnNorm(nn.Module):
         )  # of the rewards up to now, of each copy's episode
 
     @torch.no_grad()
-    def forward(self, data: TensorDictBase) -> TensorDictBase:
-        """Take the rewards of ``(num_envs, steps)`` into the statistics, then normalise them in place."""
+    def forward(
+        self, data: TensorDictBase, copies: slice = slice(None), add: Reduction = alone
+    ) -> TensorDictBase:
+        """Take rewards into the statistics, then normalise them in place.
+
+        Args:
+            data: steps ``(len(copies), steps)``.
+            copies: those that made these steps, of the ``num_envs``.
+            add: adds up tensors of all processes that share the statistics.
+        """
         outcome = data["next"]
         reward, going_on = outcome["reward"].squeeze(-1), ~outcome["done"].squeeze(-1)
-        returns = torch.empty_like(reward)
+        returns, last = torch.empty_like(reward), self.returns[copies]
         for step in range(reward.shape[-1]):
-            returns[:, step] = self.gamma * self.returns + reward[:, step]
-            torch.mul(returns[:, step], going_on[:, step], out=self.returns)
-        self.statistics.update(returns.unsqueeze(-1))
+            returns[:, step] = self.gamma * last + reward[:, step]
+            torch.mul(returns[:, step], going_on[:, step], out=last)
+        self.statistics.update(returns.unsqueeze(-1), add)
         outcome["reward"] = (outcome["reward"] / self.statistics.scale).clamp(-self.clip, self.clip)
         return data
 

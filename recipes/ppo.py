@@ -6,9 +6,9 @@ python -m nht.recipes.ppo env=wam_wipe map=nht seed=0
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import nn
-from torchrl.collectors import Collector
 from torchrl.objectives.value import GAE
 
 from nht.recipes.config import PPO
@@ -16,6 +16,7 @@ from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
 from nht.recipes.losses import GaussianPPOLoss, charge_failure, estimate_advantages, reward_range
 from nht.recipes.networks import ReturnNorm, ppo_networks
+from nht.recipes.ranks import Ranks
 from nht.recipes.training import TrainingRun
 
 LEARNED_FROM = ("features", "sample", "sample_log_prob", "state_value", "advantage", "value_target")
@@ -28,7 +29,7 @@ def main(config: PPO) -> None:
     features, actor, critic = ppo_networks(run.env, algo)
     policy = TensorDictSequential(features, actor)
     possible = reward_range(run.env)
-    rewards = ReturnNorm(config.env.num_envs, algo.gamma, algo.reward_clip).to(config.device)
+    rewards = ReturnNorm(run.copies, algo.gamma, algo.reward_clip).to(run.device)
 
     gae = GAE(gamma=algo.gamma, lmbda=algo.lmbda, value_network=None)
     loss = GaussianPPOLoss(
@@ -38,46 +39,52 @@ def main(config: PPO) -> None:
         clip_value=algo.clip_value,
         critic_coeff=algo.critic_coeff,
         entropy_coeff=algo.entropy_coeff,
+        add=run.ranks.sum if run.ranks.size > 1 else None,
     )
-    parameters = list(loss.parameters())
-    optimiser = torch.optim.Adam(parameters, lr=algo.learning_rate, eps=1e-5, fused=True)
-    collector = Collector(
-        run.env,
-        policy,
-        frames_per_batch=algo.frames_per_batch,
-        total_frames=-1,
-        track_traj_ids=False,
-        device=config.device,  # said aloud, it saves a cast in every step
-        auto_register_policy_transforms=False,
-    )
-    run.start(collector, loss=loss, optimiser=optimiser, features=features, rewards=rewards)
+    minibatch = run.ranks.share("steps of a minibatch", algo.frames_per_batch // algo.minibatches)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=algo.learning_rate, eps=1e-5, fused=True)
+    collector = run.collector(policy)
 
-    for data in collector:  # (copies, steps)
-        if algo.decay_learning_rate:
-            for group in optimiser.param_groups:
-                group["lr"] = algo.learning_rate * (1 - run.counters.frames / algo.total_frames)
-        run.count_steps(data)
-        rewards(charge_failure(data, algo.gamma, possible, steps=run.env.base_env.task.max_episode_steps))
-        estimate_advantages(data, features, critic, gae)
-        steps = data.select(*LEARNED_FROM).reshape(-1)
+    with run.training(collector, loss, optimiser=optimiser, features=features, rewards=rewards) as batches:
+        for data in batches:  # (copies, steps)
+            if algo.decay_learning_rate:
+                for group in optimiser.param_groups:
+                    group["lr"] = algo.learning_rate * (1 - run.counters.frames / algo.total_frames)
+            run.count_steps(data)
+            charge_failure(data, algo.gamma, possible, steps=run.env.base_env.task.max_episode_steps)
+            rewards(data, run.batch_copies, run.ranks.sum)
+            estimate_advantages(data, features, critic, gae)
+            steps = data.select(*LEARNED_FROM).reshape(-1)
 
-        for _ in range(algo.epochs):
-            shuffled = steps[torch.randperm(len(steps), device=steps.device)]
-            for batch in shuffled.split(len(steps) // algo.minibatches):
-                losses = loss(batch)
-                losses["loss"].backward()
-                nn.utils.clip_grad_norm_(parameters, algo.max_grad_norm)
-                optimiser.step()
-                optimiser.zero_grad()
-                run.count_update(losses)
-        features.module.update(data["observation"])  # seen by the next batch: one batch, one normalisation
+            for _ in range(algo.epochs):
+                shuffled = steps[torch.randperm(len(steps), device=steps.device)]
+                for batch in shuffled.split(minibatch):
+                    run.count_update(descend(batch, loss, optimiser, algo.max_grad_norm, run.ranks))
+            features.module.update(
+                data["observation"], run.ranks.sum
+            )  # seen by the next batch: one normalisation a batch
 
-        if run.evaluation_due:
-            run.log(evaluate(run.tests, policy))
-        run.save_if_due()
-        if run.finished:
-            break
+            if run.evaluation_due:
+                run.log(evaluate(run.tests, policy))
     run.finish(policy)
+
+
+def descend(
+    batch: TensorDictBase,
+    loss: GaussianPPOLoss,
+    optimiser: torch.optim.Optimizer,
+    max_grad_norm: float,
+    ranks: Ranks,
+) -> TensorDictBase:
+    """One gradient step, on the minibatches ``(B,)`` of all ranks as if they were one; the losses."""
+    losses = loss(batch)
+    losses["loss"].backward()
+    parameters = optimiser.param_groups[0]["params"]
+    ranks.average_gradients(parameters)
+    nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+    optimiser.step()
+    optimiser.zero_grad()
+    return losses
 
 
 if __name__ == "__main__":

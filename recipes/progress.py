@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector
 from torchrl.data.tensor_specs import ContinuousBox
 
 
@@ -28,22 +27,6 @@ class Counters:
     def load_state_dict(self, saved: dict[str, int]) -> None:
         """Go on counting from ``saved``."""
         self.frames, self.updates = saved["frames"], saved["updates"]
-
-
-class CollectorState:
-    """Where a collector stands between two batches (observation, exploration noise), to be checkpointed."""
-
-    def __init__(self, collector: Collector) -> None:
-        self._collector = collector
-
-    def state_dict(self) -> dict[str, Any]:
-        """Every entry that the next step starts from, and how many steps were made: the first may be random ones."""
-        return {"carrier": self._collector._carrier.to_dict(), "frames": self._collector._frames}
-
-    def load_state_dict(self, saved: dict[str, Any]) -> None:
-        """Start the next step from ``saved``."""
-        self._collector._carrier.update(saved["carrier"])
-        self._collector._frames = saved["frames"]
 
 
 class TrainingStatistics:
@@ -94,25 +77,28 @@ class TrainingStatistics:
         self._updates, self._episodes, self._steps = counts["updates"], counts["episodes"], counts["steps"]
         self._sums = defaultdict(float, saved.get("sums", {}))
 
-    def take(self) -> dict[str, float]:
+    def take(self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums) -> dict[str, float]:
         """The means, starting anew; NaN where nothing was counted.
+
+        Args:
+            add: adds up the sums of all processes that train together.
 
         Raises:
             FloatingPointError: if a loss is no longer finite: the networks are lost.
         """
-        for name, value in self._sums.items():
+        names = ("success", "failure", "diverged", "clipped", *self._losses)
+        counts = (self._updates, self._episodes, self._steps)
+        own = torch.tensor([*counts, *(float(self._sums[name]) for name in names)], dtype=torch.float64)
+        (updates, episodes, steps), values = (part.tolist() for part in add(own).split([3, len(names)]))
+        sums = dict(zip(names, values, strict=True))
+        for name, value in sums.items():
             if not math.isfinite(value):
-                raise FloatingPointError(
-                    f"{name} is {float(value)}: training diverged. Lower the learning rates."
-                )
-        updates, episodes = self._updates or float("nan"), self._episodes or float("nan")
+                raise FloatingPointError(f"{name} is {value}: training diverged. Lower the learning rates.")
         row = {
-            "train_success": self._sums["success"] / episodes,
-            "train_failure": self._sums["failure"] / episodes,
-            "diverged": self._sums["diverged"],  # a count: each one is a failure of map, policy or physics
-            "clipped": self._sums["clipped"]
-            / (self._steps or float("nan")),  # steps with a motor at its limit
+            "train_success": sums["success"] / (episodes or math.nan),
+            "train_failure": sums["failure"] / (episodes or math.nan),
+            "diverged": sums["diverged"],  # a count: each one is a failure of map, policy or physics
+            "clipped": sums["clipped"] / (steps or math.nan),  # steps with a motor at its limit
         }
-        row |= {name: self._sums[name] / updates for name in self._losses}
         self._clear()
-        return {name: float(value) for name, value in row.items()}
+        return row | {name: sums[name] / (updates or math.nan) for name in self._losses}

@@ -8,14 +8,13 @@ import time
 from dataclasses import asdict
 from netrc import NetrcParseError, netrc
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import pandas
 import wandb
 import yaml
 from omegaconf import OmegaConf
 from torchrl.record.loggers.wandb import WandbLogger
-from tqdm import tqdm
 
 from nht.recipes.config import DDPG, PPO, RunConfig, Training
 from nht.storage import replacing
@@ -34,6 +33,8 @@ LASTING = (
     "algo.hidden",
     "algo.activation",
     "evaluation.episodes",
+    "collector.kind",
+    "collector.num_workers",
 )
 """Settings that a checkpoint was made for: resuming cannot change them."""
 
@@ -107,7 +108,10 @@ class RunFolder:
             self._wandb.experiment.log(row, step=frames)
 
     def rewind(self, frames: int) -> None:
-        """Drop the rows behind ``frames``, or cut short by a kill: a resumed run writes them again."""
+        """Drop the rows behind ``frames``, or cut short by a kill: a resumed run writes them again.
+
+        Its clock goes on from the last row that stays.
+        """
         if not self.metrics.exists():
             return
         with self.metrics.open(newline="") as file:
@@ -116,12 +120,9 @@ class RunFolder:
         if not kept:
             self.metrics.unlink()  # its heading may be cut short, too
             return
+        self._started -= float(kept[-1][rows[0].index("seconds")])
         with replacing(self.metrics) as scratch, scratch.open("w", newline="") as file:
             csv.writer(file).writerows([rows[0], *kept])
-
-    def progress_bar(self, total: int, initial: int) -> tqdm[NoReturn]:
-        """A bar over environment steps."""
-        return tqdm(total=total, initial=initial, desc=self.path.name, unit="step", unit_scale=True)
 
     def finish(self) -> None:
         """Hand video and map to W&B, and say what happened and where the files are."""

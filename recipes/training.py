@@ -5,20 +5,29 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.collectors import BaseCollector, Collector
+from tqdm import tqdm
 
+import nht
 from nht.recipes.checkpoints import Checkpoints
+from nht.recipes.collecting import CollectorState, batch_copies, make_collector, worker_seed
 from nht.recipes.config import Training
 from nht.recipes.environments import mapped_env, run_map, test_env
 from nht.recipes.evaluation import Evaluation
 from nht.recipes.networks import save_policy
-from nht.recipes.progress import CollectorState, Counters, TrainingStatistics
+from nht.recipes.progress import Counters, TrainingStatistics
+from nht.recipes.ranks import Ranks
 from nht.recipes.run_folder import RunFolder
 from nht.recipes.video import record_video
 
@@ -28,73 +37,213 @@ VIDEO_EPISODES = 3
 class TrainingRun:
     """Seeds, folder, action map and environments of a run; its counters, rows of metrics and checkpoints.
 
+    Under torchrun every process has one: copies, batches and buffers are divided among them, and the first one writes
+    the files that there is only one of.
+
     Args:
         config: the run's whole configuration.
         losses: what an update reports, by name; each becomes a column of ``metrics.csv``.
 
+    Raises:
+        ValueError: if the number of processes does not divide the copies and what is made of them.
+
     Attributes:
-        env: the task through the run's action map, to train on.
+        ranks: the processes that learn together.
+        device: where this one learns.
+        copies: how many copies of the task are this process's.
+        env: the task through the run's action map, to train on; of parallel collectors, the copies of one worker.
         tests: the same with one copy for each test episode, on seeds of its own.
-        counters: environment steps and gradient steps so far.
+        counters: environment steps and gradient steps so far, the steps of all processes.
     """
 
     def __init__(self, config: Training, losses: Sequence[str]) -> None:
         torch.set_num_threads(config.torch_threads)
         torch.manual_seed(config.seed)
-        self._config = config
-        self._folder = RunFolder(config.run, config)
-        self._map = run_map(config, self._folder.path)
-        self.env = mapped_env(
-            config.env, self._map, config.map.action_scale, seed=config.seed, device=config.device
+        self.ranks = Ranks(config.device)
+        self.device = self.ranks.device
+        self._config = config = replace(config, device=str(self.device))
+        self.copies = self.ranks.share("env.num_envs", config.env.num_envs)
+        self._frames_per_batch = self.ranks.share("algo.frames_per_batch", config.algo.frames_per_batch)
+        self._path = Path(config.run.folder)
+        self._folder = self._open_folder() if self.ranks.first else None
+        self._resuming = self.ranks.any(self._folder is not None and self._folder.resuming)
+        self._map = self._shared_map()
+        self._make_env = partial(
+            mapped_env,
+            config.env,
+            self._map,
+            config.map.action_scale,
+            num_envs=self._copies_per_worker(),
+            device=self.device,
         )
+        self.env = self._make_env(seed=self._seed)
         self.tests = test_env(config, self._map, config.evaluation.episodes)
         self.counters = Counters()
         self._statistics = TrainingStatistics(self.env.base_env.action_spec.space, losses)
         self._stopping = False
-        self._before: Any = None  # what SIGTERM did before this run
 
-    def start(self, collector: Collector, **parts: Any) -> None:
-        """Begin, or go on where the run stopped. From now on SIGTERM ends the run after a last checkpoint.
+    def _open_folder(self) -> RunFolder:
+        run = self._config.run
+        # Processes that torchrun starts anew find the run that they were in.
+        return RunFolder(
+            replace(run, resume=run.resume or "auto") if self.ranks.restarted else run, self._config
+        )
+
+    def _shared_map(self) -> nht.ActionMap:
+        """The run's map, which the first process gets ready."""
+        if self.ranks.first:
+            run_map(self._config, self._path)
+        self.ranks.wait()
+        return run_map(self._config, self._path)
+
+    @property
+    def _seed(self) -> int:
+        """This process's own."""
+        return worker_seed(self._config.seed, self.ranks.rank) if self.ranks.rank else self._config.seed
+
+    def _copies_per_worker(self) -> int:
+        workers = self._config.collector.num_workers
+        if self.copies % workers:
+            raise ValueError(
+                f"collector.num_workers={workers} cannot share alike the {self.copies} copies that "
+                f"env.num_envs={self._config.env.num_envs} leaves each of {self.ranks.size} processes."
+            )
+        return self.copies // workers
+
+    def collector(self, policy: TensorDictModuleBase, random_frames: int = 0) -> BaseCollector:
+        """The collector of this process's batches ``(copies, steps)``, in which ``policy`` acts."""
+        config = self._config
+        if self.ranks.rank:
+            torch.manual_seed(
+                self._seed
+            )  # the networks are made, alike in all processes; they explore differently
+        self._policy = policy
+        return make_collector(
+            config.collector,
+            self.env,
+            self._make_env,
+            policy,
+            frames_per_batch=self._frames_per_batch,
+            seed=self._seed,
+            random_frames=random_frames // self.ranks.size,
+        )
+
+    @contextmanager
+    def training(
+        self, collector: BaseCollector, loss: nn.Module, **parts: Any
+    ) -> Iterator[Iterator[TensorDictBase]]:
+        """Begin, or go on where the run stopped; within, SIGTERM ends the run after a last checkpoint.
 
         Args:
             collector: of the training's batches.
+            loss: whose parameters are trained; all processes start with the first one's.
             parts: what else the algorithm goes on from, each with a ``state_dict`` and a ``load_state_dict``.
 
+        Returns:
+            the batches ``(copies, steps)`` until all steps are made. When the next one is asked for, workers get the
+            policy as it is, and checkpoints are written now and then.
+
         Raises:
-            ValueError: if the run has made all its steps already.
+            FileNotFoundError: if there is nothing to go on from.
+            ValueError: if the run has been finished already, or was made by another number of processes.
+            OSError: if there is no room for a checkpoint; earlier ones stay as they are.
+            SystemExit: after the last checkpoint, if the process was told to end.
         """
-        config: Training = self._config
-        self._collector = collector
-        self._checkpoints = Checkpoints(
-            self._folder.path / "checkpoints",
+        before: Any = None
+        try:
+            self._collector = collector
+            self._checkpoints = self._make_checkpoints(loss=loss, **parts)
+            if self._resuming:
+                self._go_on()
+            self.ranks.broadcast(loss)
+            if threading.current_thread() is threading.main_thread():  # elsewhere Python knows no signals
+                before = signal.signal(signal.SIGTERM, self._stop)
+            self._before = before
+            self._progress = tqdm(
+                total=self._config.algo.total_frames,
+                initial=self.counters.frames,
+                desc=self._path.name,
+                unit="step",
+                unit_scale=True,
+                disable=not self.ranks.first,
+            )
+            yield self._batches()
+        finally:
+            if before is not None:
+                signal.signal(signal.SIGTERM, before)
+            collector.shutdown()
+            if not self.env.is_closed:
+                self.env.close()
+
+    def _make_checkpoints(self, **parts: Any) -> Checkpoints:
+        collector = self._collector
+        if isinstance(collector, Collector):
+            parts["simulator"] = self.env.base_env.task
+        return Checkpoints(
+            self._path / "checkpoints" / self._rank_folder,
             **parts,
-            collector=CollectorState(collector),
-            simulator=self.env.base_env.task,
+            collector=CollectorState(collector, self._seed),
             test_simulator=self.tests.base_env.task,
             counters=self.counters,
             statistics=self._statistics,
         )
-        if self._folder.resuming:
-            if not self._checkpoints.load() and config.run.resume != "auto":
-                raise FileNotFoundError(f"{self._folder.path} holds no checkpoint to resume from.")
-            self._folder.rewind(self.counters.frames)
-        if self.finished:
+
+    @property
+    def _rank_folder(self) -> str:
+        return f"rank-{self.ranks.rank}" if self.ranks.size > 1 else ""
+
+    def _go_on(self) -> None:
+        """Load the newest checkpoint that all processes have."""
+        made_by = len(list((self._path / "checkpoints").glob("rank-*"))) or 1
+        if made_by != self.ranks.size and (self._path / "checkpoints").exists():
             raise ValueError(
-                f"{self._folder.path} has made its {self.counters.frames} steps: raise algo.total_frames to go on."
+                f"{self._path} holds the checkpoints of {made_by} processes: {self.ranks.size} cannot go on from them."
             )
-        self._progress = self._folder.progress_bar(config.algo.total_frames, self.counters.frames)
-        if threading.current_thread() is threading.main_thread():  # elsewhere Python knows no signals
-            self._before = signal.signal(signal.SIGTERM, self._stop)
+        common = set.intersection(*map(set, self.ranks.gather(self._checkpoints.steps())))
+        if common:
+            self._checkpoints.load(max(common))
+        elif self._config.run.resume is True:
+            raise FileNotFoundError(f"{self._path} holds no checkpoint to resume from.")
+        if self.finished and (self._path / "policy.safetensors").exists():
+            raise ValueError(
+                f"{self._path} has made its {self.counters.frames} steps: raise algo.total_frames to go on."
+            )
+        if self._folder is not None:
+            self._folder.rewind(self.counters.frames)
 
     def _stop(self, *_: Any) -> None:
         self._stopping = True
         signal.signal(signal.SIGTERM, self._before)  # the second one acts at once
 
+    def _batches(self) -> Iterator[TensorDictBase]:
+        batches = iter(self._collector)
+        while not self.finished:
+            yield next(batches)
+            if not isinstance(self._collector, Collector):
+                self._collector.update_policy_weights_(self._policy)
+            self._save_if_due()
+
+    def _save_if_due(self) -> None:
+        self._stopping = self.ranks.any(self._stopping)
+        if self._stopping or self.counters.frames % self._config.run.checkpoint_every == 0:
+            self._checkpoints.save(self.counters.frames)
+        if self._stopping and not self.finished:
+            self._progress.close()
+            if self.ranks.first:
+                print(f"{self._path} was told to end: go on with run.resume=true.")
+            sys.exit(128 + signal.SIGTERM)
+
+    @property
+    def batch_copies(self) -> slice:
+        """Which of this process's copies made the latest batch."""
+        return batch_copies(self._collector, self.env.batch_size.numel())
+
     def count_steps(self, data: TensorDictBase) -> None:
         """Take collected steps ``(*batch,)`` into counters and statistics."""
-        self.counters.frames += data.numel()
+        steps = data.numel() * self.ranks.size
+        self.counters.frames += steps
         self._statistics.add_steps(data.reshape(-1))
-        self._progress.update(data.numel())
+        self._progress.update(steps)
 
     def count_update(self, losses: TensorDictBase) -> None:
         """Take a gradient step into counters and statistics."""
@@ -104,52 +253,37 @@ class TrainingRun:
     @property
     def evaluation_due(self) -> bool:
         """Whether it is time to test the policy."""
-        config: Training = self._config
-        return self.counters.frames % config.evaluation.every == 0
+        return self.counters.frames % self._config.evaluation.every == 0
 
     def log(self, outcome: Evaluation) -> None:
-        """Write a row of metrics: the training since the last one, and an evaluation."""
-        row = self._statistics.take() | outcome.metrics() | {"updates": self.counters.updates}
-        self._folder.log(self.counters.frames, row)
+        """Write a row of metrics: the training of all processes since the last one, and an evaluation."""
+        row = self._statistics.take(self.ranks.sum) | outcome.metrics() | {"updates": self.counters.updates}
+        if self._folder is not None:
+            self._folder.log(self.counters.frames, row)
         shown = {"return": row["eval_return"]}
         if row["eval_success"] > 0:  # never, where a task has no notion of success
             shown["success"] = row["eval_success"]
         self._progress.set_postfix(shown)
 
-    def save_if_due(self) -> None:
-        """Write a checkpoint, now and then.
-
-        Raises:
-            OSError: if there is no room; earlier checkpoints stay as they are.
-            SystemExit: after the last one, if the process was told to end.
-        """
-        config: Training = self._config
-        if self._stopping or self.counters.frames % config.run.checkpoint_every == 0:
-            self._checkpoints.save(self.counters.frames)
-        if self._stopping and not self.finished:
-            self._progress.close()
-            print(f"{self._folder.path} was told to end: go on with run.resume=true.")
-            sys.exit(128 + signal.SIGTERM)
-
     @property
     def finished(self) -> bool:
         """Whether all steps are made."""
-        config: Training = self._config
-        return self.counters.frames >= config.algo.total_frames
+        return self.counters.frames >= self._config.algo.total_frames
 
-    def finish(self, policy: TensorDictModule) -> None:
+    def finish(self, policy: TensorDictModuleBase) -> None:
         """Save and film the policy, close everything, and say what happened."""
-        config: Training = self._config
-        if self._before is not None:
-            signal.signal(signal.SIGTERM, self._before)
-        self._collector.shutdown()
         self.tests.close()
         self._progress.close()
-        save_policy(policy, self._folder.path)
-        if config.evaluation.video:
-            try:
-                filmed = test_env(config, self._map, VIDEO_EPISODES)
-                record_video(filmed, policy, self._folder.path / "video.mp4")
-            except RuntimeError as error:  # a machine without OpenGL trains all the same
-                print(f"no video: {error}")
-        self._folder.finish()
+        if self._folder is not None:
+            save_policy(policy, self._path)
+            if self._config.evaluation.video:
+                self._film(policy)
+            self._folder.finish()
+        self.ranks.part()
+
+    def _film(self, policy: TensorDictModuleBase) -> None:
+        try:
+            filmed = test_env(self._config, self._map, VIDEO_EPISODES)
+            record_video(filmed, policy, self._path / "video.mp4")
+        except RuntimeError as error:  # a machine without OpenGL trains all the same
+            print(f"no video: {error}")

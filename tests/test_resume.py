@@ -159,6 +159,25 @@ def test_a_row_cut_short_is_written_again(whole, tmp_path):
     assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
 
 
+def test_a_run_that_lacks_only_its_policy_is_finished(whole, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(whole[1], folder)
+    (folder / "policy.safetensors").unlink()
+    before = pandas.read_csv(folder / "metrics.csv")
+    assert_same(folder, train(whole[0], folder, "run.resume=auto"), whole)
+    pandas.testing.assert_frame_equal(pandas.read_csv(folder / "metrics.csv"), before)
+    with pytest.raises(ValueError, match=r"has made its 600 steps: raise algo\.total_frames to go on"):
+        train(whole[0], folder, "run.resume=auto")
+
+
+def test_the_clock_goes_on(whole, tmp_path):
+    broken_off(whole, tmp_path / "run")
+    metrics = tmp_path / "run" / "metrics.csv"
+    pandas.read_csv(metrics).assign(seconds=1000.0).to_csv(metrics, index=False)
+    train(whole[0], tmp_path / "run", "run.resume=true")
+    assert pandas.read_csv(metrics)["seconds"].iloc[-1] > 1000.0
+
+
 @pytest.mark.parametrize("warned", [True, False])
 def test_a_full_disk(whole, tmp_path, monkeypatch, warned):
     broken_off(whole, tmp_path / "run")

@@ -1,0 +1,120 @@
+"""TorchRL's collectors, in this process or in several workers that each step a share of the copies."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import TransformedEnv
+
+from nht.recipes.config import CollectorConfig
+
+
+class MakeEnv(Protocol):
+    """Makes environments whose policy acts in [-1, 1]^k."""
+
+    def __call__(self, *, seed: int) -> TransformedEnv:
+        """Those with random draws from ``seed``."""
+
+
+def make_collector(
+    config: CollectorConfig,
+    env: TransformedEnv,
+    make_env: MakeEnv,
+    policy: TensorDictModuleBase,
+    *,
+    frames_per_batch: int,
+    seed: int,
+    random_frames: int = 0,
+) -> BaseCollector:
+    """The collector that ``config`` asks for; its batches are ``(copies, steps)`` and never end.
+
+    Args:
+        config: which collector, and of how many workers.
+        env: a worker's copies; the single collector steps these themselves.
+        make_env: makes more of them, in the workers.
+        policy: what acts, exploration included. Workers get its weights when ``update_policy_weights_`` is called.
+        frames_per_batch: of all workers together (sync), of the one that is ready first (async).
+        seed: that the workers' seeds come from.
+        random_frames: the first ones, whose actions are uniform.
+    """
+    settings = {"frames_per_batch": frames_per_batch, "total_frames": -1, "init_random_frames": random_frames}
+    if config.kind == "single":
+        # Said aloud, the device saves a cast in every step.
+        return Collector(
+            env,
+            policy,
+            **settings,
+            track_traj_ids=False,
+            device=env.device,
+            auto_register_policy_transforms=True,
+        )
+    makers = [
+        partial(_in_worker, make_env, worker_seed(seed, worker)) for worker in range(config.num_workers)
+    ]
+    settings |= {"device": env.device, "auto_register_policy_transforms": True}
+    if config.kind == "multi_sync":
+        return MultiSyncCollector(makers, policy, **settings, cat_results=0)
+    return FirstComeCollector(makers, policy, **settings)
+
+
+class FirstComeCollector(MultiAsyncCollector):
+    """``MultiAsyncCollector`` that tells from which worker the latest batch came.
+
+    Attributes:
+        latest: number of that worker.
+    """
+
+    latest = 0
+
+    def _get_from_queue(self, timeout: float | None = None) -> Any:
+        received = super()._get_from_queue(timeout)
+        self.latest = received[0]
+        return received
+
+
+def batch_copies(collector: BaseCollector, copies: int) -> slice:
+    """Which of a learner's copies made the latest batch: all, or the ``copies`` of one worker."""
+    if not isinstance(collector, FirstComeCollector):
+        return slice(None)
+    return slice(collector.latest * copies, (collector.latest + 1) * copies)
+
+
+def worker_seed(seed: int, *place: int) -> int:
+    """A seed for one of several owners of random numbers, by its place among them."""
+    return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0])
+
+
+def _in_worker(make_env: MakeEnv, seed: int) -> TransformedEnv:
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)  # of this process: the exploration noise
+    return make_env(seed=seed)
+
+
+class CollectorState:
+    """Where a collector stands between two batches (observation, exploration noise, counted steps), to be checkpointed.
+
+    Workers keep theirs to themselves: they go on with new episodes, on seeds that follow from how far the run has come.
+    """
+
+    def __init__(self, collector: BaseCollector, seed: int) -> None:
+        self._collector, self._seed = collector, seed
+
+    def state_dict(self) -> dict[str, Any]:
+        """Every entry that the next step starts from, and how many steps were made: the first may be random ones."""
+        saved: dict[str, Any] = {"frames": self._collector._frames}
+        if isinstance(self._collector, Collector):
+            saved["carrier"] = self._collector._carrier.to_dict()
+        return saved
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Start the next step from ``saved``."""
+        self._collector._frames = saved["frames"]
+        if isinstance(self._collector, Collector):
+            self._collector._carrier.update(saved["carrier"])
+        else:
+            cast(Any, self._collector).set_seed(worker_seed(self._seed, saved["frames"]))

@@ -1,0 +1,103 @@
+"""The learners of a run: one process, or as many as torchrun started, which learn the same weights together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor, distributed, nn
+
+
+class Ranks:
+    """This process among its fellows: what they average, add up and agree on. Alone, all of that does nothing.
+
+    Every method is to be called by all ranks, in the same order.
+
+    Args:
+        device: of the tensors; gloo connects CPUs, nccl GPUs.
+
+    Attributes:
+        rank: number of this process, 0 to ``size - 1``, on whatever machine it runs.
+        size: number of processes.
+        device: ``device``, on GPUs the one that belongs to this process.
+    """
+
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self.size = int(os.environ.get("WORLD_SIZE", "1"))
+        self.rank = int(os.environ.get("RANK", "0")) if self.size > 1 else 0
+        if self.size == 1:
+            return
+        if self.device.type == "cuda":
+            self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(self.device)
+        distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that writes files, where only one may."""
+        return self.rank == 0
+
+    @property
+    def restarted(self) -> bool:
+        """Whether torchrun started the processes anew, after one of them had died."""
+        return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+
+    def share(self, name: str, number: int) -> int:
+        """This process's part of a number that all share alike.
+
+        Raises:
+            ValueError: if it cannot be divided.
+        """
+        if number % self.size:
+            raise ValueError(
+                f"{name}={number} must be a multiple of the {self.size} processes that share it."
+            )
+        return number // self.size
+
+    def sum(self, values: Tensor) -> Tensor:
+        """The sum of all processes' tensors of this shape."""
+        if self.size == 1:
+            return values
+        total = values.detach().to(self.device, copy=True)
+        distributed.all_reduce(total)
+        return total.to(values.device)
+
+    def any(self, flag: bool) -> bool:
+        """Whether ``flag`` is true in any process."""
+        return bool(self.sum(torch.tensor(float(flag))) > 0)
+
+    def gather(self, value: list[int]) -> list[list[int]]:
+        """The lists of all processes, by rank."""
+        if self.size == 1:
+            return [value]
+        gathered: list[list[int]] = [[] for _ in range(self.size)]
+        distributed.all_gather_object(gathered, value)
+        return gathered
+
+    def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Put the mean of all processes' gradients in the place of each one's own: one flat all-reduce."""
+        if self.size == 1:
+            return
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        mean = self.sum(torch.cat([gradient.flatten() for gradient in gradients])).div_(self.size)
+        for gradient, part in zip(gradients, mean.split([g.numel() for g in gradients]), strict=True):
+            gradient.copy_(part.view_as(gradient))
+
+    def broadcast(self, module: nn.Module) -> None:
+        """Give all processes the parameters and buffers of the first one's module."""
+        if self.size == 1:
+            return
+        for value in module.state_dict().values():
+            distributed.broadcast(value, src=0)
+
+    def wait(self) -> None:
+        """Go on when all have come here."""
+        if self.size > 1:
+            distributed.barrier()
+
+    def part(self) -> None:
+        """Leave the group."""
+        if self.size > 1 and distributed.is_initialized():
+            distributed.destroy_process_group()

@@ -1,0 +1,157 @@
+"""The hyperparameters of a search: distributions, what is drawn from them, and the manifest that keeps it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from nht.storage import replacing
+
+Value = int | float | str
+ROWS_FORMAT = 1
+VERSION = f"{version('nht')}/{ROWS_FORMAT}"
+"""Of everything that a search writes: rows of different versions do not go together."""
+
+GROWING = ("configs", "seeds", "best_seeds")
+"""Settings that a search may be continued with more of."""
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Where a hyperparameter is drawn from (Bergstra & Bengio 2012 define the kinds).
+
+    Args:
+        kind: ``uniform``, ``integer`` (uniform, both ends included), ``exponential`` (uniform in the logarithm),
+            ``geometric`` (that, rounded to an integer) or ``choice`` (each as likely).
+        values: low and high, or the choices.
+    """
+
+    kind: str
+    values: tuple[Value, ...]
+
+    @classmethod
+    def parse(cls, name: str, written: dict[str, Any]) -> Distribution:
+        """From ``{kind: values}`` in a YAML file.
+
+        Raises:
+            ValueError: for an unknown kind, or values that it cannot have.
+        """
+        if len(written) != 1 or next(iter(written)) not in KINDS:
+            raise ValueError(f"search.space.{name} must be one of {list(KINDS)}: [...], got {dict(written)}.")
+        ((kind, values),) = written.items()
+        if kind == "choice":
+            if not values:
+                raise ValueError(f"search.space.{name}: a choice needs values, got none.")
+            return cls(kind, tuple(values))
+        if len(values) != 2 or not values[0] < values[1]:
+            raise ValueError(
+                f"search.space.{name}: {kind} takes [low, high] with low < high, got {list(values)}."
+            )
+        if kind in ("exponential", "geometric") and values[0] <= 0:
+            raise ValueError(f"search.space.{name}: {kind} needs positive bounds, got {list(values)}.")
+        return cls(kind, tuple(values))
+
+    def at(self, quantile: float) -> Value:
+        """The value that the share ``quantile`` in [0, 1) of all draws lies below."""
+        return KINDS[self.kind](quantile, *self.values) if self.kind != "choice" else self._chosen(quantile)
+
+    def _chosen(self, quantile: float) -> Value:
+        return self.values[int(quantile * len(self.values))]
+
+
+def _uniform(quantile: float, low: float, high: float) -> float:
+    return low + quantile * (high - low)
+
+
+def _integer(quantile: float, low: int, high: int) -> int:
+    return low + int(quantile * (high + 1 - low))
+
+
+def _exponential(quantile: float, low: float, high: float) -> float:
+    return math.exp(_uniform(quantile, math.log(low), math.log(high)))
+
+
+def _geometric(quantile: float, low: int, high: int) -> int:
+    return round(_exponential(quantile, low, high))
+
+
+KINDS: dict[str, Any] = {
+    "uniform": _uniform,
+    "integer": _integer,
+    "exponential": _exponential,
+    "geometric": _geometric,
+    "choice": None,
+}
+
+
+Space = dict[str, dict[str, dict[str, list[Any]]]]
+"""By interface, and under ``agent`` for all of them: each hyperparameter's name as on the command line, its kind of
+distribution, its values."""
+
+
+def draw(space: Space, seed: int, configuration: int, interface: str) -> dict[str, Value]:
+    """One configuration of an interface: a value for each of its hyperparameters.
+
+    Every hyperparameter has a generator of its own, seeded by its name, the search's seed and the configuration's
+    number. So a value depends neither on what else is drawn nor on how many configurations there are; all interfaces
+    share the agent's; and where one has a range of its own, it gets the same quantile of it.
+
+    Args:
+        space: the distributions.
+        seed: of the search.
+        configuration: its number.
+        interface: whose.
+
+    Raises:
+        ValueError: for a distribution that does not exist.
+    """
+    distributions = space["agent"] | space.get(interface, {})
+    return {
+        name: Distribution.parse(f"{interface}.{name}", written).at(quantile(seed, configuration, name))
+        for name, written in distributions.items()
+    }
+
+
+def quantile(seed: int, configuration: int, name: str) -> float:
+    """What one hyperparameter's generator draws, in [0, 1)."""
+    return float(np.random.default_rng([seed, configuration, crc32(name.encode())]).random())
+
+
+def write_manifest(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """The search's manifest: the one that is there, which must be of the same search, else a new one.
+
+    Args:
+        path: of the JSON file.
+        settings: everything that decides what is run.
+
+    Raises:
+        ValueError: if the file is of another search or version; names each difference.
+    """
+    manifest = {"version": VERSION, "settings": settings}
+    if path.exists():
+        _check_same(path, json.loads(path.read_text()), manifest)
+    with replacing(path) as scratch:
+        scratch.write_text(json.dumps(manifest, indent=1))
+    return manifest
+
+
+def _check_same(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    if old["version"] != new["version"]:
+        raise ValueError(
+            f"{path} was written by version {old['version']}, this is {new['version']}: choose another folder."
+        )
+    before, now = old["settings"], new["settings"]
+    changed = [
+        f"{name} was {before.get(name)}, is {now.get(name)}"
+        for name in sorted(before.keys() | now.keys())
+        if before.get(name) != now.get(name) and not (name in GROWING and now[name] >= before[name])
+    ]
+    if changed:
+        raise ValueError(f"{path} is of another search: {'; '.join(changed)}. Choose another search.folder.")
