@@ -212,6 +212,8 @@ class RunConfig:
     checkpoint_every: int = 50_000  # frames
     wandb: bool = True
     wandb_project: str = "nht"
+    wandb_group: str | None = None
+    wandb_job_type: str | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for another way to resume."""
@@ -330,6 +332,49 @@ class CompareMaps:
     action_dims: list[int] = field(default_factory=lambda: [1, 2, 3])
     seed: int = 0
     out: str = ""
+
+
+@dataclass
+class SearchConfig:
+    """What is searched: interfaces x configurations x seeds, each a run of a recipe."""
+
+    recipe: str = "ddpg"
+    env: str = "wam_wipe"
+    action_dim: int = 2  # of learned maps
+    metric: str = "success"  # or return: of a run's last evaluation
+    interfaces: list[str] = field(default_factory=list)  # kinds of maps; raw is the actuation itself
+    configs: int = 128
+    seeds: int = 5
+    seed: int = 0  # of the draw
+    total_frames: int = 1_000_000
+    best_seeds: int = 5  # fresh ones, on which the best configuration of each interface is run again
+    best_frames: int = 1_000_000
+    base: list[str] = field(default_factory=list)  # what every run is told, as on the recipe's command line
+    space: dict[str, Any] = field(default_factory=dict)  # see recipes/search_space.py
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a search of nothing, or by what runs do not report."""
+        for name in ("configs", "seeds", "total_frames", "best_frames"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"search.{name} must be at least 1, got {getattr(self, name)}.")
+        if self.best_seeds < 0:
+            raise ValueError(f"search.best_seeds must not be negative, got {self.best_seeds}.")
+        if self.metric not in ("success", "return"):
+            raise ValueError(f"search.metric must be success or return, got {self.metric!r}.")
+        if self.recipe not in ("ddpg", "ppo"):
+            raise ValueError(f"search.recipe must be ddpg or ppo, got {self.recipe!r}.")
+
+
+@dataclass
+class Search:
+    """``python -m nht.recipes.search``."""
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    folder: str = ""  # several machines may share it
+    ray_address: str | None = None  # of a cluster, host:port or auto; None starts Ray on this machine
+    num_workers: int | None = None  # runs at a time on this machine; None is one for each core
+    retry_failed: bool = False  # runs that failed or diverged before
 
 
 @dataclass

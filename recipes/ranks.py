@@ -7,6 +7,8 @@ from collections.abc import Iterable
 
 import torch
 from torch import Tensor, distributed, nn
+from torch.distributed import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
 
 class Ranks:
@@ -32,7 +34,11 @@ class Ranks:
         if self.device.type == "cuda":
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
             torch.cuda.set_device(self.device)
-        distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+        # torchrun keeps its store over a restart, and with it the addresses of processes that are gone.
+        store, rank, size = next(rendezvous("env://"))
+        attempt = PrefixStore(f"attempt-{self.restarts}", store)
+        backend = "nccl" if self.device.type == "cuda" else "gloo"
+        distributed.init_process_group(backend, store=attempt, rank=rank, world_size=size)
 
     @property
     def first(self) -> bool:
@@ -40,9 +46,9 @@ class Ranks:
         return self.rank == 0
 
     @property
-    def restarted(self) -> bool:
-        """Whether torchrun started the processes anew, after one of them had died."""
-        return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+    def restarts(self) -> int:
+        """How often torchrun has started the processes anew, after one of them had died."""
+        return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
     def share(self, name: str, number: int) -> int:
         """This process's part of a number that all share alike.

@@ -93,6 +93,8 @@ class RunFolder:
             project=run.wandb_project,
             offline=not _logged_in(),
             config=asdict(config),
+            group=run.wandb_group,
+            job_type=run.wandb_job_type,
         )
 
     def log(self, frames: int, row: dict[str, float]) -> None:

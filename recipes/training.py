@@ -86,7 +86,7 @@ class TrainingRun:
         run = self._config.run
         # Processes that torchrun starts anew find the run that they were in.
         return RunFolder(
-            replace(run, resume=run.resume or "auto") if self.ranks.restarted else run, self._config
+            replace(run, resume=run.resume or "auto") if self.ranks.restarts else run, self._config
         )
 
     def _shared_map(self) -> nht.ActionMap:

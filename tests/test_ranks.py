@@ -146,7 +146,7 @@ def test_one_process_shares_nothing():
     ranks = Ranks()
     values = torch.arange(3.0)
     assert ranks.first
-    assert not ranks.restarted
+    assert ranks.restarts == 0
     assert ranks.size == 1
     assert ranks.share("env.num_envs", 7) == 7
     assert ranks.sum(values) is values

@@ -1,0 +1,114 @@
+"""Many runs at a time, on this machine or on a cluster: Ray."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+# Workers keep the number of torch threads, and say nothing about it.
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from nht.recipes.search_tasks import Outcome, Task
+
+Work = TypeVar("Work", bound=Callable[..., Any])
+ANSWER = 15.0
+"""Seconds within which a cluster must answer."""
+
+
+class Cluster:
+    """Ray, started on this machine or connected to.
+
+    Args:
+        address: of a cluster, ``host:port`` or ``auto``; None starts Ray here.
+        num_workers: tasks at a time, where Ray is started here; None is one for each core.
+
+    Raises:
+        ConnectionError: if nothing answers at ``address``.
+        ImportError: if a machine of the cluster lacks this package, or has another version of it.
+    """
+
+    def __init__(self, address: str | None = None, num_workers: int | None = None) -> None:
+        if address is None:
+            ray.init(
+                num_cpus=num_workers, include_dashboard=False, log_to_driver=False, logging_level="error"
+            )
+        else:
+            _check_answer(address)
+            ray.init(address, log_to_driver=False, logging_level="error")
+        try:
+            _check_machines()
+        except BaseException:
+            self.close()
+            raise
+
+    def run(
+        self, work: Callable[[Task, Path], Outcome | None], tasks: Sequence[Task], folder: Path
+    ) -> Iterator[Task]:
+        """Do ``work(task, folder)`` for all tasks, one core each, and give each back once it is done.
+
+        A task whose worker dies is tried again, three times; then it is recorded as failed.
+        """
+        remote = ray.remote(num_cpus=1, max_retries=3)(work)
+        waiting = {remote.remote(task, folder): task for task in tasks}
+        while waiting:
+            (ready,), _ = ray.wait(list(waiting), num_returns=1)
+            task = waiting.pop(ready)
+            try:
+                ray.get(ready)
+            except RayError as error:
+                reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+                Outcome("failed", reason).write(folder / task.name)
+            yield task
+
+    def close(self) -> None:
+        """End the workers of this machine, or leave the cluster."""
+        ray.shutdown()
+
+
+def _check_answer(address: str) -> None:
+    if address == "auto":
+        return  # Ray itself says at once if there is none
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=ANSWER).close()
+    except (OSError, ValueError) as error:
+        raise ConnectionError(f"no Ray cluster answers at ray_address={address}: {error}.") from error
+
+
+def _check_machines() -> None:
+    """Every machine must have this package; what is sent there to look cannot need it."""
+
+    def installed() -> str | None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("nht")
+        except PackageNotFoundError:
+            return None
+
+    look = ray.remote(num_cpus=0)(installed)
+    nodes = [node for node in ray.nodes() if node["Alive"]]
+    found = ray.get(
+        [
+            look.options(
+                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            ).remote()
+            for node in nodes
+        ]
+    )
+    for node, there in zip(nodes, found, strict=True):
+        if there != version("nht"):
+            has = "has no nht" if there is None else f"has nht {there}"
+            raise ImportError(
+                f"{node['NodeManagerHostname']} {has}, this machine has {version('nht')}: install the same there "
+                "(pip install 'nht[search]'), then start again. What was finished is kept."
+            )

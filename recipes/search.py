@@ -1,0 +1,239 @@
+"""The paper's central experiment: hyperparameters drawn at random, trained with every interface, on Ray.
+
+python -m nht.recipes.search search=wam search.configs=128 search.seeds=5
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+from tqdm import tqdm
+
+from nht.recipes.cluster import Cluster
+from nht.recipes.config import Search, SearchConfig
+from nht.recipes.launch import configure, launch
+from nht.recipes.recording import record_expert
+from nht.recipes.search_space import draw, write_manifest
+from nht.recipes.search_tasks import RECIPES, Outcome, Task, claimed, rows_of, run_task
+from nht.recipes.train_map import KINDS
+from nht.storage import replacing
+
+FRESH = 100
+"""First seed of the runs of best configurations: the search's own count from 0."""
+
+POLL = 5.0
+"""Seconds between two looks at runs that other processes are at."""
+
+
+def main(config: Search) -> None:
+    """Draw, run what is not there yet, run the best again on fresh seeds, and say how it came out."""
+    search, folder = config.search, Path(config.folder).resolve()
+    check_interfaces(search)
+    write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
+    demos = shared_demos(config, folder)
+    tasks = search_tasks(search, demos)
+    check_settings(tasks, folder)
+    with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
+        rows = run_all(tasks, folder, cluster, config.retry_failed, before=None)
+        best = best_tasks(search, demos, rows)
+        rows = run_all(best, folder, cluster, config.retry_failed, before=rows)
+    print(summary(rows, search.metric).to_string(index=False))
+    print(f"\n{folder}: manifest.json, rows.csv; figures: python -m nht.recipes.report {config.folder}")
+
+
+def check_interfaces(search: SearchConfig) -> None:
+    """Raise ValueError for an interface that does not exist."""
+    known = ["raw", *sorted(KINDS.keys() - {"none"})]
+    if unknown := [name for name in search.interfaces if name not in known]:
+        raise ValueError(f"unknown search.interfaces {unknown}: choose from {known}.")
+    if not search.interfaces:
+        raise ValueError(f"search.interfaces is empty: choose from {known}.")
+
+
+def search_tasks(search: SearchConfig, demos: str | None) -> list[Task]:
+    """Every run of the search, those of all interfaces of one configuration and seed after each other."""
+    return [
+        make_task(search, demos, "search", interface, configuration, seed, search.total_frames)
+        for configuration in range(search.configs)
+        for seed in range(search.seeds)
+        for interface in search.interfaces
+    ]
+
+
+def best_tasks(search: SearchConfig, demos: str | None, rows: pandas.DataFrame) -> list[Task]:
+    """The best configuration of each interface, on fresh seeds."""
+    scores = final_scores(rows[rows["stage"] == "search"], search.metric)
+    means = scores.groupby(["interface", "configuration"])["score"].mean()
+    best = {interface: int(means[interface].idxmax()) for interface in search.interfaces}
+    return [
+        make_task(search, demos, "best", interface, configuration, FRESH + seed, search.best_frames)
+        for seed in range(search.best_seeds)
+        for interface, configuration in best.items()
+    ]
+
+
+def make_task(
+    search: SearchConfig,
+    demos: str | None,
+    stage: str,
+    interface: str,
+    configuration: int,
+    seed: int,
+    frames: int,
+) -> Task:
+    """One run: what a person would type."""
+    parameters = draw(search.space, search.seed, configuration, interface)
+    told = dict(parameters)
+    if "map.hidden_layers" in told:
+        told["map.hidden"] = str(int(told.pop("map.hidden_layers")) * [told.pop("map.hidden_units")])
+    overrides = [f"env={search.env}", f"map={'none' if interface == 'raw' else interface}"]
+    overrides += [] if interface in ("raw", "jacobian") else [f"map.action_dim={search.action_dim}"]
+    overrides += [] if demos is None else [f"demos.path={demos}"]
+    overrides += [*search.base, *(f"{name}={value}" for name, value in told.items())]
+    overrides += [f"seed={seed}", f"algo.total_frames={frames}"]
+    overrides += [f"run.wandb_group={stage}-{configuration:03d}", f"run.wandb_job_type={interface}"]
+    return Task(
+        stage, search.env, interface, configuration, seed, search.recipe, parameters, tuple(overrides)
+    )
+
+
+def check_settings(tasks: Sequence[Task], folder: Path) -> None:
+    """Raise ValueError if a recipe does not take what it would be told, before anything is run."""
+    for task in {task.interface: task for task in tasks}.values():
+        _, schema = RECIPES[task.recipe]
+        configure(schema, task.recipe, [*task.overrides, f"run.folder={folder}"])
+
+
+def shared_demos(config: Search, folder: Path) -> str | None:
+    """The demonstrations that all runs share: those given, else the expert's, recorded once into the folder."""
+    if config.demos.path is not None:
+        return str(Path(config.demos.path).resolve())
+    recorded = folder / "demos"
+    while not recorded.exists():
+        with claimed(folder / "claims" / "demos") as ours:
+            if ours and not recorded.exists():
+                env = task_env(config.search)
+                scratch = folder / f".demos-{os.getpid()}"
+                shutil.rmtree(scratch, ignore_errors=True)
+                record_expert(env, config.demos, config.search.seed, scratch)
+                scratch.rename(recorded)
+        time.sleep(0 if recorded.exists() else POLL)
+    return str(recorded)
+
+
+def task_env(search: SearchConfig) -> Any:
+    """The configuration of the environment that all runs have."""
+    _, schema = RECIPES[search.recipe]
+    return configure(schema, search.recipe, [f"env={search.env}", "map=none", *search.base]).env
+
+
+def run_all(
+    tasks: Sequence[Task],
+    folder: Path,
+    cluster: Cluster,
+    retry_failed: bool,
+    before: pandas.DataFrame | None,
+) -> pandas.DataFrame:
+    """Run those tasks that have not ended, and keep ``rows.csv`` up to date; its rows.
+
+    Args:
+        tasks: of one stage.
+        folder: of the search.
+        cluster: where they run.
+        retry_failed: whether those that failed before are run once more.
+        before: rows of an earlier stage, which stand first.
+    """
+    if retry_failed:
+        forget_failures(tasks, folder)
+    ended = {
+        task.name: rows_of(task, folder) for task in tasks if Outcome.read(folder / task.name) is not None
+    }
+    with progress(tasks, folder, len(ended)) as show:
+        while missing := [task for task in tasks if task.name not in ended]:
+            for task in cluster.run(run_task, missing, folder):
+                if Outcome.read(folder / task.name) is None:
+                    continue  # another process is at it
+                ended[task.name] = rows_of(task, folder)
+                write_rows(folder, before, [ended[done.name] for done in tasks if done.name in ended])
+                show(ended)
+            if len(ended) < len(tasks):
+                time.sleep(POLL)
+    return write_rows(folder, before, [ended[task.name] for task in tasks])
+
+
+def forget_failures(tasks: Sequence[Task], folder: Path) -> None:
+    """Let those tasks that have failed begin anew."""
+    for task in tasks:
+        outcome = Outcome.read(folder / task.name)
+        if outcome is not None and outcome.status != "done":
+            shutil.rmtree(folder / task.name)
+
+
+@contextmanager
+def progress(tasks: Sequence[Task], folder: Path, initial: int) -> Iterator[Any]:
+    """A bar over the runs of a stage."""
+    stage = tasks[0].stage if tasks else "search"
+    with tqdm(total=len(tasks), initial=initial, desc=f"{folder.name}, {stage}", unit="run") as bar:
+
+        def show(ended: dict[str, pandas.DataFrame]) -> None:
+            failed = sum(rows["status"].iloc[0] != "done" for rows in ended.values())
+            running = len(list((folder / "claims").glob(f"{stage}-*")))
+            bar.set_postfix(failed=failed, running=running, refresh=False)
+            bar.update(len(ended) - bar.n)
+
+        yield show
+
+
+def write_rows(
+    folder: Path, before: pandas.DataFrame | None, rows: Sequence[pandas.DataFrame]
+) -> pandas.DataFrame:
+    """Replace ``rows.csv``, whole or not at all; what stands in it now."""
+    parts = [part for part in (before, *rows) if part is not None]
+    together = pandas.concat([part.dropna(axis="columns", how="all") for part in parts], ignore_index=True)
+    columns = list(dict.fromkeys(name for part in parts for name in part.columns))
+    together = together.reindex(columns=columns)
+    with replacing(folder / "rows.csv") as scratch:
+        together.to_csv(scratch, index=False)
+    return together
+
+
+def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
+    """The last evaluation of every run as its ``score``; of one that did not get to its end, the worst there is."""
+    runs = rows.groupby(["stage", "interface", "configuration", "seed"], sort=False).tail(1).copy()
+    score = runs[f"eval_{metric}"].astype(float)
+    worst = 0.0 if metric == "success" else score.min()
+    return runs.assign(score=np.where((runs["status"] == "done") & score.notna(), score, worst))
+
+
+def summary(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
+    """How each interface came out, a row each."""
+    scores = final_scores(rows, metric)
+    table = []
+    for interface, runs in scores.groupby("interface", sort=False):
+        searched, again = (runs[runs["stage"] == stage] for stage in ("search", "best"))
+        means = searched.groupby("configuration")["score"].mean()
+        table.append(
+            {
+                "interface": interface,
+                "configurations": len(means),
+                "seeds": searched["seed"].nunique(),
+                f"median {metric}": f"{means.median():.4g}",
+                "best": f"{means.max():.4g} (number {means.idxmax()})",
+                "best on fresh seeds": f"{again['score'].mean():.4g}" if len(again) else "-",
+                "failed runs": int((searched["status"] != "done").sum()),
+            }
+        )
+    return pandas.DataFrame(table)
+
+
+if __name__ == "__main__":
+    launch(main, Search, "search")
