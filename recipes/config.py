@@ -379,10 +379,11 @@ class Search:
 
 @dataclass
 class Report:
-    """``python -m nht.recipes.report``."""
+    """``python -m nht.recipes.report DIR``."""
 
+    folder: str = ""  # of a search, or of runs
     runs: list[str] = field(default_factory=list)  # folders of runs, or folders that hold them
-    out: str = ""
+    out: str = ""  # "" is a folder called report in the first of these
     title: str = ""
     metric: str = "success"  # or return: what the table and the curves show of every evaluation
 

@@ -1,13 +1,12 @@
-"""Finished runs side by side: a table and learning curves.
+"""Finished runs side by side, as a table and learning curves; or a whole search, as figures and a page.
 
-python -m nht.recipes.report runs=[runs/demo] out=runs/demo
+python -m nht.recipes.report runs/demo
+python -m nht.recipes.report runs/search-wam_wipe
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 
@@ -16,22 +15,41 @@ matplotlib.use("Agg")  # no display is needed
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas
-from numpy.typing import NDArray
-from scipy import stats
 
 from nht.recipes.config import Report
 from nht.recipes.launch import launch
 from nht.recipes.run_folder import read_config
-
-RESAMPLES = 2_000
-CONFIDENCE = 0.95
+from nht.recipes.scores import interquartile_mean, interval
+from nht.recipes.search_report import to_markdown, write_report
 
 
 def main(config: Report) -> None:
-    """Read the runs, write ``curves.csv``, ``table.md`` and the curves of ``metric``, and print the table."""
-    out = Path(config.out)
+    """Report a search if there is one in the folder, else the runs in and below it."""
+    folder = Path(config.folder)
+    if config.folder and (rows := folder / "rows.csv").exists():
+        report_search(rows, Path(config.out or folder / "report"), config.title)
+    else:
+        report_runs(config)
+
+
+def report_search(rows: Path, out: Path, title: str) -> None:
+    """Write the figures of a search and the page around them, and print its table."""
+    print(write_report(rows, out, title).to_string(index=False))
+    print(f"\n{out}: " + ", ".join(sorted(path.name for path in out.iterdir())))
+
+
+def report_runs(config: Report) -> None:
+    """Read the runs, write ``curves.csv``, ``table.md`` and the curves of ``metric``, and print the table.
+
+    Raises:
+        ValueError: if no folder is named.
+    """
+    folders = [*config.runs, *([config.folder] if config.folder else [])]
+    if not folders:
+        raise ValueError("name a folder of runs or of a search: report DIR, or report runs=[DIR, DIR].")
+    out = Path(config.out or Path(folders[0]) / "report")
     out.mkdir(parents=True, exist_ok=True)
-    curves = read_runs([Path(folder) for folder in config.runs])
+    curves = read_runs([Path(folder) for folder in folders])
     curves.to_csv(out / "curves.csv", index=False)
     table = summarise(curves, config.metric)
     (out / "table.md").write_text(to_markdown(table))
@@ -99,33 +117,6 @@ def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
     return group[seeds == group["seed"].nunique()]
 
 
-def interquartile_mean(scores: NDArray[np.float64], axis: int = 0) -> NDArray[np.float64] | np.float64:
-    """The mean of the middle half of the scores."""
-    return stats.trim_mean(scores, 0.25, axis=axis)
-
-
-def interval(scores: NDArray[np.float64], statistic: Callable[..., Any] = np.mean) -> tuple[float, float]:
-    """Bootstrap interval of a statistic over seeds (percentiles, a generator of its own); a point for one seed."""
-    if len(scores) < 2 or np.ptp(scores) == 0:
-        return float(scores.mean()), float(scores.mean())
-    found = stats.bootstrap(
-        (scores,),
-        statistic,
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
-
-
-def to_markdown(table: pandas.DataFrame) -> str:
-    """The table in Markdown."""
-    lines = ["| " + " | ".join(table.columns) + " |", "|" + "---|" * len(table.columns)]
-    lines += ["| " + " | ".join(map(str, row)) + " |" for row in table.to_numpy()]
-    return "\n".join(lines) + "\n"
-
-
 def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path) -> None:
     """Mean over the seeds of every interface, with its interval, against environment steps."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
@@ -148,4 +139,4 @@ def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    launch(main, Report, "report")
+    launch(main, Report, "report", positional="folder")

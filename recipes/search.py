@@ -14,7 +14,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas
 from tqdm import tqdm
 
@@ -22,6 +21,8 @@ from nht.recipes.cluster import Cluster
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure, launch
 from nht.recipes.recording import record_expert
+from nht.recipes.search_report import summary
+from nht.recipes.search_results import SearchResults, final_scores
 from nht.recipes.search_space import draw, write_manifest
 from nht.recipes.search_tasks import RECIPES, Outcome, Task, claimed, rows_of, run_task
 from nht.recipes.train_map import KINDS
@@ -38,15 +39,17 @@ def main(config: Search) -> None:
     """Draw, run what is not there yet, run the best again on fresh seeds, and say how it came out."""
     search, folder = config.search, Path(config.folder).resolve()
     check_interfaces(search)
-    write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
-    demos = shared_demos(config, folder)
+    demos = Path(config.demos.path or folder / "demos").resolve()
     tasks = search_tasks(search, demos)
     check_settings(tasks, folder)
+    write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
+        if config.demos.path is None:
+            record_demos(config, folder, demos)
         rows = run_all(tasks, folder, cluster, config.retry_failed, before=None)
         best = best_tasks(search, demos, rows)
         rows = run_all(best, folder, cluster, config.retry_failed, before=rows)
-    print(summary(rows, search.metric).to_string(index=False))
+    print(summary(SearchResults.of(rows)).to_string(index=False))
     print(f"\n{folder}: manifest.json, rows.csv; figures: python -m nht.recipes.report {config.folder}")
 
 
@@ -59,7 +62,7 @@ def check_interfaces(search: SearchConfig) -> None:
         raise ValueError(f"search.interfaces is empty: choose from {known}.")
 
 
-def search_tasks(search: SearchConfig, demos: str | None) -> list[Task]:
+def search_tasks(search: SearchConfig, demos: Path) -> list[Task]:
     """Every run of the search, those of all interfaces of one configuration and seed after each other."""
     return [
         make_task(search, demos, "search", interface, configuration, seed, search.total_frames)
@@ -69,7 +72,7 @@ def search_tasks(search: SearchConfig, demos: str | None) -> list[Task]:
     ]
 
 
-def best_tasks(search: SearchConfig, demos: str | None, rows: pandas.DataFrame) -> list[Task]:
+def best_tasks(search: SearchConfig, demos: Path, rows: pandas.DataFrame) -> list[Task]:
     """The best configuration of each interface, on fresh seeds."""
     scores = final_scores(rows[rows["stage"] == "search"], search.metric)
     means = scores.groupby(["interface", "configuration"])["score"].mean()
@@ -83,7 +86,7 @@ def best_tasks(search: SearchConfig, demos: str | None, rows: pandas.DataFrame) 
 
 def make_task(
     search: SearchConfig,
-    demos: str | None,
+    demos: Path,
     stage: str,
     interface: str,
     configuration: int,
@@ -97,12 +100,19 @@ def make_task(
         told["map.hidden"] = str(int(told.pop("map.hidden_layers")) * [told.pop("map.hidden_units")])
     overrides = [f"env={search.env}", f"map={'none' if interface == 'raw' else interface}"]
     overrides += [] if interface in ("raw", "jacobian") else [f"map.action_dim={search.action_dim}"]
-    overrides += [] if demos is None else [f"demos.path={demos}"]
-    overrides += [*search.base, *(f"{name}={value}" for name, value in told.items())]
+    overrides += [f"demos.path={demos}", *search.base, *(f"{name}={value}" for name, value in told.items())]
     overrides += [f"seed={seed}", f"algo.total_frames={frames}"]
     overrides += [f"run.wandb_group={stage}-{configuration:03d}", f"run.wandb_job_type={interface}"]
     return Task(
-        stage, search.env, interface, configuration, seed, search.recipe, parameters, tuple(overrides)
+        stage=stage,
+        env=search.env,
+        interface=interface,
+        configuration=configuration,
+        seed=seed,
+        recipe=search.recipe,
+        metric=search.metric,
+        parameters=parameters,
+        overrides=tuple(overrides),
     )
 
 
@@ -113,21 +123,16 @@ def check_settings(tasks: Sequence[Task], folder: Path) -> None:
         configure(schema, task.recipe, [*task.overrides, f"run.folder={folder}"])
 
 
-def shared_demos(config: Search, folder: Path) -> str | None:
-    """The demonstrations that all runs share: those given, else the expert's, recorded once into the folder."""
-    if config.demos.path is not None:
-        return str(Path(config.demos.path).resolve())
-    recorded = folder / "demos"
-    while not recorded.exists():
+def record_demos(config: Search, folder: Path, demos: Path) -> None:
+    """Let the expert give the demonstrations that all runs share; of several processes one does it, others wait."""
+    while not demos.exists():
         with claimed(folder / "claims" / "demos") as ours:
-            if ours and not recorded.exists():
-                env = task_env(config.search)
+            if ours and not demos.exists():
                 scratch = folder / f".demos-{os.getpid()}"
                 shutil.rmtree(scratch, ignore_errors=True)
-                record_expert(env, config.demos, config.search.seed, scratch)
-                scratch.rename(recorded)
-        time.sleep(0 if recorded.exists() else POLL)
-    return str(recorded)
+                record_expert(task_env(config.search), config.demos, config.search.seed, scratch)
+                scratch.rename(demos)
+        time.sleep(0 if demos.exists() else POLL)
 
 
 def task_env(search: SearchConfig) -> Any:
@@ -204,35 +209,6 @@ def write_rows(
     with replacing(folder / "rows.csv") as scratch:
         together.to_csv(scratch, index=False)
     return together
-
-
-def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
-    """The last evaluation of every run as its ``score``; of one that did not get to its end, the worst there is."""
-    runs = rows.groupby(["stage", "interface", "configuration", "seed"], sort=False).tail(1).copy()
-    score = runs[f"eval_{metric}"].astype(float)
-    worst = 0.0 if metric == "success" else score.min()
-    return runs.assign(score=np.where((runs["status"] == "done") & score.notna(), score, worst))
-
-
-def summary(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
-    """How each interface came out, a row each."""
-    scores = final_scores(rows, metric)
-    table = []
-    for interface, runs in scores.groupby("interface", sort=False):
-        searched, again = (runs[runs["stage"] == stage] for stage in ("search", "best"))
-        means = searched.groupby("configuration")["score"].mean()
-        table.append(
-            {
-                "interface": interface,
-                "configurations": len(means),
-                "seeds": searched["seed"].nunique(),
-                f"median {metric}": f"{means.median():.4g}",
-                "best": f"{means.max():.4g} (number {means.idxmax()})",
-                "best on fresh seeds": f"{again['score'].mean():.4g}" if len(again) else "-",
-                "failed runs": int((searched["status"] != "done").sum()),
-            }
-        )
-    return pandas.DataFrame(table)
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ class Task:
         configuration: its number.
         seed: of map and agent.
         recipe: ``ddpg`` or ``ppo``.
+        metric: what the run is judged by, ``success`` or ``return``.
         parameters: what was drawn, by dotted name.
         overrides: everything that the recipe is told, the run's folder aside.
     """
@@ -50,6 +51,7 @@ class Task:
     configuration: int
     seed: int
     recipe: str
+    metric: str
     parameters: dict[str, Value]
     overrides: tuple[str, ...]
 
@@ -202,6 +204,7 @@ def rows_of(task: Task, folder: Path) -> pandas.DataFrame:
     rows = measured.reindex(columns=METRICS)
     known: dict[str, Value] = {
         "version": VERSION,
+        "metric": task.metric,
         "stage": task.stage,
         "env": task.env,
         "interface": task.interface,

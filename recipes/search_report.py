@@ -1,0 +1,193 @@
+"""The report of a search: its raw rows, read, checked and told in tables, figures and a page."""
+
+from __future__ import annotations
+
+import base64
+import html
+from pathlib import Path
+
+import numpy as np
+import pandas
+
+from nht.recipes import search_figures
+from nht.recipes.scores import (
+    Scores,
+    interquartile_mean,
+    interval,
+    percentiles,
+    probability_of_improvement,
+    resampled,
+)
+from nht.recipes.search_results import OURS, SearchResults, read_results
+
+
+def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
+    """Write figures (PNG, SVG), ``report.md`` and ``report.html``; the first table.
+
+    The same rows give the same files, byte for byte.
+    """
+    results = read_results(file)
+    out.mkdir(parents=True, exist_ok=True)
+    title = title or f"Search on {', '.join(results.rows['env'].unique())}"
+    figures = search_figures.draw_all(results, out)
+    table = summary(results)
+    sections = [(None, f"{counts(results)}\n"), ("Interfaces", table), ("Failed runs", failures(results))]
+    sections += [("Hyperparameters", categories(results))] if len(categories(results)) else []
+    (out / "report.md").write_text(_markdown(title, sections, figures))
+    (out / "report.html").write_text(_html(title, sections, figures, out))
+    return table
+
+
+def counts(results: SearchResults) -> str:
+    """How much was run, in a sentence."""
+    runs = results.stage("search")
+    again = results.stage("best")
+    text = (
+        f"{runs['configuration'].nunique()} configurations x {runs['seed'].nunique()} seeds of "
+        f"{runs['frames'].max():,.0f} steps for each of {len(results.interfaces)} interfaces, {len(runs)} runs"
+    )
+    if len(again):
+        text += (
+            f"; the best configuration of each once more on {again['seed'].nunique()} fresh seeds, "
+            f"{again['frames'].max():,.0f} steps"
+        )
+    return f"{text}. Score: {results.metric} of the test episodes after the last step. Intervals: 95 %, bootstrap."
+
+
+def summary(results: SearchResults, seed: int = 0) -> pandas.DataFrame:
+    """A row per interface: how it does over configurations, and at its best."""
+    rng = np.random.default_rng(seed)
+    digits = ".3f" if results.metric == "success" else ",.0f"
+    rows = []
+    for interface in results.interfaces:
+        scores = results.scores(interface)
+        again = resampled(scores, rng)
+        flat = again.reshape(len(again), -1)
+        low, high = percentiles(interquartile_mean(flat, axis=1))
+        number, _, fresh = results.best(interface)
+        fresh_scores = _fresh_scores(results, interface)
+        best = fresh_scores if fresh else scores[scores.mean(1).argmax()]
+        ends = interval(best)
+        rows.append(
+            {
+                "interface": interface,
+                "IQM of runs": f"{interquartile_mean(scores.ravel()):{digits}} ({low:{digits}} .. {high:{digits}})",
+                "median configuration": f"{np.median(scores.mean(1)):{digits}}",
+                "best configuration": number,
+                "its score": f"{best.mean():{digits}} ({ends[0]:{digits}} .. {ends[1]:{digits}})",
+                "on": f"{len(best)} fresh seeds" if fresh else "the search's seeds",
+                f"P({OURS} better)": _improvement(results, interface, rng),
+            }
+        )
+    return pandas.DataFrame(rows)
+
+
+def _fresh_scores(results: SearchResults, interface: str) -> Scores:
+    runs = results.stage("best")
+    return runs[runs["interface"] == interface]["score"].to_numpy(dtype=float)
+
+
+def _improvement(results: SearchResults, interface: str, rng: np.random.Generator) -> str:
+    """The probability that ours beats an interface, with its interval, over the configurations that both have."""
+    if interface == OURS or OURS not in results.interfaces:
+        return "-"
+    ours, theirs = results.scores(OURS), results.scores(interface)
+    if len(ours) != len(theirs):
+        return "configurations differ"
+    found = float(probability_of_improvement(ours, theirs))
+    # The same configurations on both sides: they share the agent's hyperparameters.
+    drawn = rng.integers(len(ours), size=(500, len(ours)))
+    seeds = [rng.integers(s.shape[1], size=(*drawn.shape, s.shape[1])) for s in (ours, theirs)]
+    again = [s[drawn[..., None], seed] for s, seed in zip((ours, theirs), seeds, strict=True)]
+    low, high = percentiles(probability_of_improvement(*again))
+    return f"{found:.2f} ({low:.2f} .. {high:.2f})"
+
+
+def failures(results: SearchResults) -> pandas.DataFrame:
+    """Share of runs that failed or diverged, and the commonest reason."""
+    rows = []
+    for interface in results.interfaces:
+        runs = results.runs[results.runs["interface"] == interface]
+        bad = runs[runs["status"] != "done"]
+        reasons = bad["reason"].value_counts()
+        rows.append(
+            {
+                "interface": interface,
+                "runs": len(runs),
+                "failed": f"{(runs['status'] == 'failed').mean():.1%}",
+                "diverged": f"{(runs['status'] == 'diverged').mean():.1%}",
+                "commonest reason": f"{reasons.index[0]} ({reasons.iloc[0]})" if len(reasons) else "-",
+            }
+        )
+    return pandas.DataFrame(rows)
+
+
+def categories(results: SearchResults) -> pandas.DataFrame:
+    """Mean score by the value of each hyperparameter that is not a number."""
+    rows = []
+    for interface in results.interfaces:
+        means = results.configurations(interface)
+        texts = means[results.parameters].select_dtypes(exclude="number").dropna(axis="columns", how="all")
+        for name in texts:
+            for value, group in means.groupby(name):
+                rows.append(
+                    {
+                        "interface": interface,
+                        "hyperparameter": name,
+                        "value": value,
+                        "configurations": len(group),
+                    }
+                    | {"mean score": f"{group['score'].mean():.3g}"}
+                )
+    return pandas.DataFrame(rows)
+
+
+Sections = list[tuple[str | None, str | pandas.DataFrame]]
+
+
+def _markdown(title: str, sections: Sections, figures: list[search_figures.Figure]) -> str:
+    parts = [f"# {title}\n"]
+    for heading, content in sections:
+        parts += [f"## {heading}\n"] if heading else []
+        parts.append(content if isinstance(content, str) else to_markdown(content))
+    parts += [
+        f"## {figure.title}\n\n{figure.caption}\n\n![{figure.title}]({figure.name}.png)\n"
+        for figure in figures
+    ]
+    return "\n".join(parts)
+
+
+def to_markdown(table: pandas.DataFrame) -> str:
+    """The table in Markdown."""
+    lines = ["| " + " | ".join(table.columns) + " |", "|" + "---|" * len(table.columns)]
+    lines += [
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |" for row in table.to_numpy()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+table { border-collapse: collapse; font-size: 14px } th, td { padding: .3rem .7rem; text-align: left }
+tr { border-bottom: 1px solid #ddd } img { max-width: 100% } p { color: #555 }
+"""
+
+
+def _html(title: str, sections: Sections, figures: list[search_figures.Figure], out: Path) -> str:
+    """One file, pictures included."""
+    parts = [f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"]
+    parts.append(f"<h1>{html.escape(title)}</h1>")
+    for heading, content in sections:
+        parts += [f"<h2>{heading}</h2>"] if heading else []
+        text = isinstance(content, str)
+        parts.append(f"<p>{html.escape(str(content))}</p>" if text else _html_table(content))
+    for figure in figures:
+        picture = base64.b64encode((out / f"{figure.name}.svg").read_bytes()).decode()
+        parts.append(f"<h2>{figure.title}</h2><p>{html.escape(figure.caption)}</p>")
+        parts.append(f'<img alt="{figure.title}" src="data:image/svg+xml;base64,{picture}">')
+    return "\n".join(parts)
+
+
+def _html_table(table: str | pandas.DataFrame) -> str:
+    assert isinstance(table, pandas.DataFrame)
+    return table.to_html(index=False, border=0)

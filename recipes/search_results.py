@@ -1,0 +1,129 @@
+"""What a search left behind: its raw rows, read and checked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas
+from scipy import stats
+
+from nht.recipes.scores import Scores
+
+COLUMNS = (
+    "version",
+    "metric",
+    "stage",
+    "env",
+    "interface",
+    "configuration",
+    "seed",
+    "status",
+    "reason",
+    "frames",
+    "eval_success",
+    "eval_failure",
+    "eval_return",
+    "seconds",
+)
+"""Of ``rows.csv``; those behind them are hyperparameters."""
+
+OURS = "nht"
+
+
+@dataclass(frozen=True)
+class SearchResults:
+    """Rows of a search, and the final score of every run.
+
+    Attributes:
+        rows: one per evaluation.
+        runs: one per run, with its ``score``: the last evaluation, or the worst there is if it did not get there.
+        metric: ``success`` or ``return``.
+    """
+
+    rows: pandas.DataFrame
+    runs: pandas.DataFrame
+    metric: str
+
+    @classmethod
+    def of(cls, rows: pandas.DataFrame) -> SearchResults:
+        """The results in rows that are known to be good."""
+        metric = str(rows["metric"].iloc[0])
+        return cls(rows, final_scores(rows, metric), metric)
+
+    @property
+    def interfaces(self) -> list[str]:
+        """In the order of the rows, ours first."""
+        found = list(dict.fromkeys(self.rows["interface"]))
+        return sorted(found, key=lambda name: name != OURS)
+
+    @property
+    def parameters(self) -> list[str]:
+        """The hyperparameters that were drawn."""
+        return [name for name in self.rows.columns if name not in COLUMNS]
+
+    def stage(self, stage: str) -> pandas.DataFrame:
+        """The runs of a stage."""
+        return self.runs[self.runs["stage"] == stage]
+
+    def scores(self, interface: str) -> Scores:
+        """Final scores of the search, ``(configurations, seeds)``, of the configurations that all seeds have."""
+        runs = self.stage("search")
+        table = runs[runs["interface"] == interface].pivot(
+            index="configuration", columns="seed", values="score"
+        )
+        return table.dropna().to_numpy()
+
+    def best(self, interface: str) -> tuple[int, pandas.DataFrame, bool]:
+        """The configuration with the best mean, the evaluations of its runs, and whether these are on fresh seeds."""
+        runs = self.stage("search")
+        means = runs[runs["interface"] == interface].groupby("configuration")["score"].mean()
+        number = int(means.idxmax())
+        of_it = self.rows[(self.rows["interface"] == interface) & (self.rows["configuration"] == number)]
+        fresh = of_it[of_it["stage"] == "best"]
+        return number, (fresh if len(fresh) else of_it[of_it["stage"] == "search"]), bool(len(fresh))
+
+    def configurations(self, interface: str) -> pandas.DataFrame:
+        """A row per configuration of an interface: its hyperparameters and the mean of its scores."""
+        runs = self.stage("search")
+        grouped = runs[runs["interface"] == interface].groupby("configuration")
+        return grouped[self.parameters].first().assign(score=grouped["score"].mean())
+
+    def correlations(self) -> pandas.DataFrame:
+        """Spearman's rank correlation of each numeric hyperparameter with the configurations' scores, by interface."""
+        table: dict[str, dict[str, float]] = {}
+        for interface in self.interfaces:
+            means = self.configurations(interface)
+            numeric = means[self.parameters].select_dtypes("number").dropna(axis="columns", how="all")
+            table[interface] = {
+                str(name): float(stats.spearmanr(values, means["score"]).statistic)
+                for name, values in numeric.items()
+                if values.nunique() > 1 and means["score"].nunique() > 1
+            }
+        drawn = [name for name in self.parameters if any(name in column for column in table.values())]
+        return pandas.DataFrame(table).reindex(drawn)
+
+
+def read_results(file: Path) -> SearchResults:
+    """Read ``rows.csv``.
+
+    Raises:
+        ValueError: if it has no rows, lacks columns, or its rows are of different versions.
+    """
+    rows = pandas.read_csv(file)
+    if missing := [name for name in COLUMNS if name not in rows.columns]:
+        raise ValueError(f"{file} lacks the columns {missing}: it is not what a search writes.")
+    if rows.empty:
+        raise ValueError(f"{file} has no rows: the search has not finished a run yet.")
+    if len(versions := sorted(rows["version"].unique())) > 1:
+        raise ValueError(f"{file} mixes rows of the versions {versions}, which do not go together.")
+    return SearchResults.of(rows)
+
+
+def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
+    """The last evaluation of every run as its ``score``; of one that did not get to its end, the worst there is."""
+    runs = rows.groupby(["stage", "interface", "configuration", "seed"], sort=False).tail(1).copy()
+    score = runs[f"eval_{metric}"].astype(float)
+    worst = 0.0 if metric == "success" else score.min()
+    return runs.assign(score=np.where((runs["status"] == "done") & score.notna(), score, worst))
