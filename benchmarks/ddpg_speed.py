@@ -3,6 +3,7 @@
 Contestants, one process, one torch thread, in turn within each round:
 
 - ``nht``: `nht.recipes.ddpg` itself, run for two lengths; the difference is divided by the steps between them.
+- ``nht-bf16``: the same with ``algo.bfloat16=true``.
 - ``sb3-10`` and ``sb3-1``: stable-baselines3's DDPG on 10 (as many as ours) and on 1 Gymnasium environments.
 
 CPU seconds decide, for other programs may share the cores. Prints the table and writes ``results/ddpg_speed.csv``.
@@ -28,16 +29,17 @@ from nht.recipes.ddpg import main
 from nht.recipes.launch import configure
 
 STEPS, COPIES, HIDDEN, BATCH = 1_000, 10, [256, 256], 256
-SHORT, LONG = 1_000, 3_000  # steps of the recipe
+SHORT, LONG = 500, 1_500  # steps of the recipe
 
 
-def recipe_seconds(task: str) -> tuple[float, float]:
+def recipe_seconds(task: str, bfloat16: bool = False) -> tuple[float, float]:
     """CPU and wall seconds of ``STEPS`` steps of the recipe."""
 
     def run(frames: int) -> None:
         with tempfile.TemporaryDirectory() as folder:
             settings = [f"env={task}", "map=none", "algo=ddpg_locomotion", f"run.folder={folder}/run"]
             settings += [f"algo.hidden={HIDDEN}", f"algo.batch_size={BATCH}", "algo.warmup_frames=0"]
+            settings += ["algo.random_frames=0", f"algo.bfloat16={bfloat16}"]
             settings += ["algo.buffer_size=100000", f"algo.total_frames={frames}", f"env.num_envs={COPIES}"]
             settings += [f"evaluation.every={frames}", "evaluation.episodes=1", "evaluation.video=false"]
             settings += ["run.wandb=false", "run.checkpoint_every=10000000"]
@@ -72,9 +74,10 @@ def benchmark(task: str, rounds: int) -> None:
     """All contestants in turn, round after round."""
     torch.set_num_threads(1)
     others = {f"sb3-{copies}": stable_baselines(task, copies) for copies in (COPIES, 1)}
-    measured: dict[str, list[tuple[float, float]]] = {name: [] for name in ("nht", *others)}
+    measured: dict[str, list[tuple[float, float]]] = {name: [] for name in ("nht", "nht-bf16", *others)}
     for _ in range(rounds + 1):  # the first one warms up
         measured["nht"].append(recipe_seconds(task))
+        measured["nht-bf16"].append(recipe_seconds(task, bfloat16=True))
         for name, iterate in others.items():
             measured[name].append(timed(iterate, times=1))
     report("ddpg_speed", task, STEPS, {name: values[1:] for name, values in measured.items()})

@@ -23,14 +23,13 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.objectives import SoftUpdate
 
 import nht
 from nht.recipes.config import DDPG
 from nht.recipes.ddpg import STORED, main
 from nht.recipes.environments import mapped_env
 from nht.recipes.launch import configure
-from nht.recipes.losses import PaperDDPGLoss, n_step_returns
+from nht.recipes.losses import JointSoftUpdate, PaperDDPGLoss, n_step_returns
 from nht.recipes.networks import ddpg_networks, exploring
 
 ROUNDS = 4
@@ -43,7 +42,7 @@ def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
     env = mapped_env(config.env, map, config.map.action_scale, seed=0)
     features, actor, critic = ddpg_networks(env, algo)
     loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2)
-    target = SoftUpdate(loss, eps=algo.polyak)
+    target = JointSoftUpdate(loss, eps=algo.polyak)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-6, fused=True)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), batch_size=algo.batch_size)
     collector = Collector(
@@ -76,7 +75,9 @@ def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
     return {
         "collect": lambda: next(batches),
         "store": store,
-        "sample": buffer.sample,
+        "sample": lambda: list(
+            buffer.sample(algo.updates_per_batch * algo.batch_size).split(algo.batch_size)
+        ),
         "normalise": normalise,
         "loss and backward": descend,
         "optimiser": lambda: (optimiser.step(), optimiser.zero_grad(set_to_none=False)),
@@ -123,7 +124,7 @@ def benchmark() -> None:
         measured: dict[str, list[float]] = {name: [] for name in (*calls, "loop")}
         for _ in range(ROUNDS + 1):  # the first one warms up
             for name, call in calls.items():
-                each = 1 if name in ("collect", "store") else updates
+                each = 1 if name in ("collect", "store", "sample") else updates
                 measured[name].append(each * cpu_seconds(call, times=10 if each == 1 else 50))
             rounds = (LONG - SHORT) / config.algo.frames_per_batch
             measured["loop"].append((loop_seconds(map_file, LONG) - loop_seconds(map_file, SHORT)) / rounds)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-# Workers keep the number of torch threads, and say nothing about it.
-os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
 
 import ray
 from ray.exceptions import RayError
@@ -19,7 +17,6 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from nht.recipes.search_tasks import Outcome, Task
 
-Work = TypeVar("Work", bound=Callable[..., Any])
 ANSWER = 15.0
 """Seconds within which a cluster must answer."""
 
@@ -39,11 +36,14 @@ class Cluster:
     def __init__(self, address: str | None = None, num_workers: int | None = None) -> None:
         if address is None:
             ray.init(
-                num_cpus=num_workers, include_dashboard=False, log_to_driver=False, logging_level="error"
+                num_cpus=num_workers,
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
             )
         else:
             _check_answer(address)
-            ray.init(address, log_to_driver=False, logging_level="error")
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
         try:
             _check_machines()
         except BaseException:

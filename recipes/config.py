@@ -104,6 +104,7 @@ class DDPGConfig(AlgoConfig):
     random_action: float = 0.1  # probability of a uniform action instead
     pessimism: float = 0.8  # the critic starts at this times the lowest return that is possible
     observation_clip: float = 5.0  # of the normalised observation
+    bfloat16: bool = False  # the precision of hidden layers' matrix products; weights stay float32
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.objectives import SoftUpdate
 
 from nht.recipes.config import DDPG
 from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
-from nht.recipes.losses import PaperDDPGLoss, charge_failure, n_step_returns, reward_range
+from nht.recipes.losses import JointSoftUpdate, PaperDDPGLoss, charge_failure, n_step_returns, reward_range
 from nht.recipes.networks import ddpg_networks, exploring
 from nht.recipes.ranks import Ranks
 from nht.recipes.training import TrainingRun
@@ -39,8 +38,8 @@ def main(config: DDPG) -> None:
 
     rewards = reward_range(run.env)
     loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
+    target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
-    target = SoftUpdate(loss, eps=algo.polyak)
     optimiser = torch.optim.Adam(
         [
             {"params": list(loss.actor_network_params.values(True, True)), "lr": algo.actor_learning_rate},
@@ -50,8 +49,8 @@ def main(config: DDPG) -> None:
     )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(run.ranks.share("algo.buffer_size", algo.buffer_size), device=run.device),
-        batch_size=run.ranks.share("algo.batch_size", algo.batch_size),
     )
+    batch_size = run.ranks.share("algo.batch_size", algo.batch_size)
     collector = run.collector(exploring(policy, run.env, algo), random_frames=algo.random_frames)
 
     with run.training(collector, loss, optimiser=optimiser, features=features, buffer=buffer) as batches:
@@ -61,11 +60,14 @@ def main(config: DDPG) -> None:
             data = look_ahead(charge_failure(data, algo.gamma, rewards)).reshape(-1)
             buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
 
-            for _ in range(algo.updates_per_batch if run.counters.frames >= algo.warmup_frames else 0):
-                losses = descend(buffer.sample().to(run.device), features, loss, optimiser, run.ranks)
-                run.count_update(losses)
-                if run.counters.updates % algo.target_update_every == 0:
-                    target.step()
+            if run.counters.frames >= algo.warmup_frames and algo.updates_per_batch:
+                replay = buffer.sample(algo.updates_per_batch * batch_size).to(run.device)
+                with torch.no_grad():
+                    features(replay), features(replay["next"])
+                for batch in replay.split(batch_size):
+                    run.count_update(descend(batch, loss, optimiser, run.ranks))
+                    if run.counters.updates % algo.target_update_every == 0:
+                        target.step()
 
             if run.evaluation_due:
                 run.log(evaluate(run.tests, policy))
@@ -74,14 +76,11 @@ def main(config: DDPG) -> None:
 
 def descend(
     batch: TensorDictBase,
-    features: TensorDictModule,
     loss: PaperDDPGLoss,
     optimiser: torch.optim.Optimizer,
     ranks: Ranks,
 ) -> TensorDictBase:
     """One gradient step of actor and critic, on the batches ``(B,)`` of all ranks as if they were one; the losses."""
-    with torch.no_grad():
-        features(batch), features(batch["next"])
     losses = loss(batch)
     (losses["loss_actor"] + losses["loss_value"]).backward()
     ranks.average_gradients(loss.parameters())

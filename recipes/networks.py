@@ -154,6 +154,19 @@ class GaussianActor(nn.Module):
         return -0.5 * deviates.square().sum(-1) - self.log_std.sum() - constant
 
 
+class HalfPrecisionMLP(MLP):
+    """An ``MLP`` whose hidden layers multiply in bfloat16. The last one adds up in float32: values need more digits."""
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """``(*batch, size)``, or parts of it, to ``(*batch, out)``."""
+        hidden = torch.cat(inputs, -1)
+        *layers, last = self
+        with torch.autocast(hidden.device.type, torch.bfloat16):
+            for layer in layers:
+                hidden = layer(hidden)
+        return last(hidden.float())
+
+
 def ppo_networks(
     env: EnvBase, algo: PPOConfig
 ) -> tuple[TensorDictModule, TensorDictModule, TensorDictModule]:
@@ -199,8 +212,9 @@ def ddpg_networks(
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     norm = RunningNorm(size, algo.observation_clip).to(env.device)
     hidden = {"num_cells": list(algo.hidden), "activation_class": nn.ReLU, "device": env.device}
-    actor = nn.Sequential(MLP(size, action_dim, **hidden), nn.Tanh())
-    critic = MLP(size + action_dim, 1, **hidden)
+    network = HalfPrecisionMLP if algo.bfloat16 else MLP
+    actor = nn.Sequential(network(size, action_dim, **hidden), nn.Tanh())
+    critic = network(size + action_dim, 1, **hidden)
     lowest, _ = return_range(reward_range(env), algo.gamma)
     nn.init.constant_(critic[-1].bias, algo.pessimism * lowest if math.isfinite(lowest) else 0.0)
     return (

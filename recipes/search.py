@@ -22,7 +22,7 @@ from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure, launch
 from nht.recipes.recording import record_expert
 from nht.recipes.search_report import summary
-from nht.recipes.search_results import SearchResults, final_scores
+from nht.recipes.search_results import SearchResults, read_results
 from nht.recipes.search_space import draw, write_manifest
 from nht.recipes.search_tasks import RECIPES, Outcome, Task, claimed, rows_of, run_task
 from nht.recipes.train_map import KINDS
@@ -74,9 +74,8 @@ def search_tasks(search: SearchConfig, demos: Path) -> list[Task]:
 
 def best_tasks(search: SearchConfig, demos: Path, rows: pandas.DataFrame) -> list[Task]:
     """The best configuration of each interface, on fresh seeds."""
-    scores = final_scores(rows[rows["stage"] == "search"], search.metric)
-    means = scores.groupby(["interface", "configuration"])["score"].mean()
-    best = {interface: int(means[interface].idxmax()) for interface in search.interfaces}
+    results = SearchResults.of(rows)
+    best = {interface: results.best(interface)[0] for interface in search.interfaces}
     return [
         make_task(search, demos, "best", interface, configuration, FRESH + seed, search.best_frames)
         for seed in range(search.best_seeds)
@@ -150,6 +149,8 @@ def run_all(
 ) -> pandas.DataFrame:
     """Run those tasks that have not ended, and keep ``rows.csv`` up to date; its rows.
 
+    What stands in ``rows.csv`` already has ended, too: with the manifest it is all that another machine needs to go on.
+
     Args:
         tasks: of one stage.
         folder: of the search.
@@ -159,7 +160,7 @@ def run_all(
     """
     if retry_failed:
         forget_failures(tasks, folder)
-    ended = {
+    ended = kept_rows(tasks, folder) | {
         task.name: rows_of(task, folder) for task in tasks if Outcome.read(folder / task.name) is not None
     }
     with progress(tasks, folder, len(ended)) as show:
@@ -175,8 +176,20 @@ def run_all(
     return write_rows(folder, before, [ended[task.name] for task in tasks])
 
 
+def kept_rows(tasks: Sequence[Task], folder: Path) -> dict[str, pandas.DataFrame]:
+    """The rows of those tasks that ``rows.csv`` has, by the task's name."""
+    if not (folder / "rows.csv").exists():
+        return {}
+    runs = read_results(folder / "rows.csv").rows.groupby(["stage", "interface", "configuration", "seed"])
+    known = {(task.stage, task.interface, task.configuration, task.seed): task.name for task in tasks}
+    return {known[place]: rows.dropna(axis="columns", how="all") for place, rows in runs if place in known}
+
+
 def forget_failures(tasks: Sequence[Task], folder: Path) -> None:
     """Let those tasks that have failed begin anew."""
+    if (file := folder / "rows.csv").exists():
+        rows = pandas.read_csv(file)
+        rows[rows["status"] == "done"].to_csv(file, index=False)
     for task in tasks:
         outcome = Outcome.read(folder / task.name)
         if outcome is not None and outcome.status != "done":

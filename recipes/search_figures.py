@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -13,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
+from matplotlib.ticker import MaxNLocator
 
 from nht.recipes.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 from nht.recipes.search_results import SearchResults
@@ -27,7 +29,7 @@ COLOURS = {
 }
 """Okabe and Ito's, which the colour-blind can tell apart; the same in every figure."""
 OTHERS = ("#D55E00", "#A6761D", "#7570B3")
-REPEATABLE = {"svg.hashsalt": "nht", "savefig.dpi": 150, "font.size": 10}
+REPEATABLE: Any = {"svg.hashsalt": "nht", "savefig.dpi": 150, "font.size": 10}
 BAND_RESAMPLES = 500
 
 
@@ -162,11 +164,11 @@ def _budget(results: SearchResults, out: Path) -> Figure:
     rng = np.random.default_rng(0)
     for name in results.interfaces:
         scores = results.scores(name)
-        tried = np.arange(1, len(scores) + 1)
+        tried = np.arange(1.0, len(scores) + 1)
         axes.plot(tried, best_of(scores.mean(1)), "o-", markersize=4, color=colour(name), label=name)
         _band(axes, tried, best_of(resampled(scores, rng, BAND_RESAMPLES).mean(-1)), name)
     axes.set(xlabel="configurations tried", ylabel=f"expected best: {_label(results)}")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _bound(axes, results)
     canvas.legend(loc="outside right upper", fontsize=9)
     text = (

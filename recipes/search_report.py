@@ -20,6 +20,9 @@ from nht.recipes.scores import (
 )
 from nht.recipes.search_results import OURS, SearchResults, read_results
 
+Sections = list[tuple[str | None, str | pandas.DataFrame]]
+"""Of the page: headings, and what stands below them."""
+
 
 def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
     """Write figures (PNG, SVG), ``report.md`` and ``report.html``; the first table.
@@ -31,7 +34,11 @@ def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
     title = title or f"Search on {', '.join(results.rows['env'].unique())}"
     figures = search_figures.draw_all(results, out)
     table = summary(results)
-    sections = [(None, f"{counts(results)}\n"), ("Interfaces", table), ("Failed runs", failures(results))]
+    sections: Sections = [
+        (None, f"{counts(results)}\n"),
+        ("Interfaces", table),
+        ("Failed runs", failures(results)),
+    ]
     sections += [("Hyperparameters", categories(results))] if len(categories(results)) else []
     (out / "report.md").write_text(_markdown(title, sections, figures))
     (out / "report.html").write_text(_html(title, sections, figures, out))
@@ -129,7 +136,7 @@ def categories(results: SearchResults) -> pandas.DataFrame:
         means = results.configurations(interface)
         texts = means[results.parameters].select_dtypes(exclude="number").dropna(axis="columns", how="all")
         for name in texts:
-            for value, group in means.groupby(name):
+            for value, group in means.groupby(str(name)):
                 rows.append(
                     {
                         "interface": interface,
@@ -140,9 +147,6 @@ def categories(results: SearchResults) -> pandas.DataFrame:
                     | {"mean score": f"{group['score'].mean():.3g}"}
                 )
     return pandas.DataFrame(rows)
-
-
-Sections = list[tuple[str | None, str | pandas.DataFrame]]
 
 
 def _markdown(title: str, sections: Sections, figures: list[search_figures.Figure]) -> str:

@@ -79,7 +79,7 @@ class SearchResults:
         """The configuration with the best mean, the evaluations of its runs, and whether these are on fresh seeds."""
         runs = self.stage("search")
         means = runs[runs["interface"] == interface].groupby("configuration")["score"].mean()
-        number = int(means.idxmax())
+        number = int(means.index.to_numpy()[means.to_numpy().argmax()])
         of_it = self.rows[(self.rows["interface"] == interface) & (self.rows["configuration"] == number)]
         fresh = of_it[of_it["stage"] == "best"]
         return number, (fresh if len(fresh) else of_it[of_it["stage"] == "search"]), bool(len(fresh))
@@ -111,14 +111,14 @@ def read_results(file: Path) -> SearchResults:
     Raises:
         ValueError: if it has no rows, lacks columns, or its rows are of different versions.
     """
-    rows = pandas.read_csv(file)
+    rows = pandas.read_csv(file, dtype={"reason": str})
     if missing := [name for name in COLUMNS if name not in rows.columns]:
         raise ValueError(f"{file} lacks the columns {missing}: it is not what a search writes.")
     if rows.empty:
         raise ValueError(f"{file} has no rows: the search has not finished a run yet.")
     if len(versions := sorted(rows["version"].unique())) > 1:
         raise ValueError(f"{file} mixes rows of the versions {versions}, which do not go together.")
-    return SearchResults.of(rows)
+    return SearchResults.of(rows.assign(reason=rows["reason"].fillna("")))
 
 
 def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:

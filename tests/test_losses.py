@@ -12,7 +12,14 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from nht.envs import make_env
 from nht.recipes.config import DDPGConfig
-from nht.recipes.losses import PaperDDPGLoss, charge_failure, n_step_returns, return_range, reward_range
+from nht.recipes.losses import (
+    JointSoftUpdate,
+    PaperDDPGLoss,
+    charge_failure,
+    n_step_returns,
+    return_range,
+    reward_range,
+)
 from nht.recipes.networks import RunningNorm, ddpg_networks
 
 GAMMA = 0.9
@@ -89,7 +96,7 @@ def test_ddpg_loss_is_torchrls():
     ours = PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=0.0, reward_range=(-math.inf, math.inf))
     theirs = DDPGLoss(deepcopy(actor), deepcopy(critic), **settings)
     theirs.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
-    updaters = [SoftUpdate(module, eps=0.5) for module in (ours, theirs)]
+    updaters = [JointSoftUpdate(ours, eps=0.75), SoftUpdate(theirs, eps=0.75)]
     optimisers = [torch.optim.SGD(module.parameters(), lr=0.1) for module in (ours, theirs)]
     for _ in range(3):
         flags = torch.rand(2, 64, 1) < 0.3
@@ -107,7 +114,7 @@ def test_ddpg_loss_is_torchrls():
             optimiser.step()
             optimiser.zero_grad()
             updater.step()
-        weights, expected = ours.state_dict(), theirs.state_dict()
+        weights, expected = ours.state_dict(), theirs.state_dict()  # those of the target networks, too
         torch.testing.assert_close(dict(weights), {key: expected[key] for key in weights})
 
 

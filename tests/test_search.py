@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -113,6 +114,12 @@ def test_a_search_from_start_to_end(cluster, tmp_path, capsys):
     # Again: nothing is left to do. Then more of the same.
     count = len(cluster.done)
     pandas.testing.assert_frame_equal(run_search(tmp_path / "search"), rows)
+    assert len(cluster.done) == count
+    # On another machine, with nothing but the manifest and the rows.
+    for name in ("manifest.json", "rows.csv"):
+        (tmp_path / "elsewhere").mkdir(exist_ok=True)
+        shutil.copy(tmp_path / "search" / name, tmp_path / "elsewhere" / name)
+    pandas.testing.assert_frame_equal(run_search(tmp_path / "elsewhere"), rows)
     assert len(cluster.done) == count
     more = run_search(tmp_path / "search", "search.seeds=2")
     assert len(cluster.done) == count + 2

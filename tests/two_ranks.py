@@ -8,10 +8,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP
-from torchrl.objectives import SoftUpdate
 
 from nht.recipes import ddpg, ppo
-from nht.recipes.losses import GaussianPPOLoss, PaperDDPGLoss
+from nht.recipes.losses import GaussianPPOLoss, JointSoftUpdate, PaperDDPGLoss
 from nht.recipes.networks import GaussianActor, ReturnNorm, RunningNorm
 from nht.recipes.ranks import Ranks
 
@@ -70,7 +69,7 @@ def update(algorithm, ranks):
     rewards = ReturnNorm(BATCH // ranks.size, gamma=0.9)
     if algorithm == "ddpg":
         loss = PaperDDPGLoss(actor, critic, gamma=0.9, action_l2=0.1)
-        target = SoftUpdate(loss, eps=0.9)
+        target = JointSoftUpdate(loss, eps=0.9)
     else:
         coefficients = {"clip": 0.2, "clip_value": True, "critic_coeff": 0.5, "entropy_coeff": 0.01}
         loss = GaussianPPOLoss(actor, critic, **coefficients, add=ranks.sum if ranks.size > 1 else None)
@@ -84,11 +83,12 @@ def update(algorithm, ranks):
         batch = whole.chunk(ranks.size)[ranks.rank].clone()
         norm.module.update(batch["observation"], ranks.sum)
         rewards(batch.unsqueeze(1), add=ranks.sum)
+        norm(batch)
         if algorithm == "ddpg":
-            ddpg.descend(batch, norm, loss, optimiser, ranks)
+            norm(batch["next"])
+            ddpg.descend(batch, loss, optimiser, ranks)
             target.step()
         else:
-            norm(batch)
             ppo.descend(batch, loss, optimiser, 0.5, ranks)
     return [
         *loss.state_dict().values(),
