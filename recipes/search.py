@@ -8,11 +8,11 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pandas
 from tqdm import tqdm
@@ -22,9 +22,17 @@ from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure, launch
 from nht.recipes.recording import record_expert
 from nht.recipes.search_report import summary
-from nht.recipes.search_results import SearchResults, read_results
+from nht.recipes.search_results import COLUMNS, SearchResults, read_results
 from nht.recipes.search_space import draw, write_manifest
-from nht.recipes.search_tasks import RECIPES, Outcome, Task, claimed, rows_of, run_task
+from nht.recipes.search_tasks import (
+    RECIPES,
+    Outcome,
+    Task,
+    claimed,
+    rows_of,
+    run_task,
+    task_name,
+)
 from nht.recipes.train_map import KINDS
 from nht.storage import replacing
 
@@ -46,10 +54,11 @@ def main(config: Search) -> None:
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
         if config.demos.path is None:
             record_demos(config, folder, demos)
-        rows = run_all(tasks, folder, cluster, config.retry_failed, before=None)
-        best = best_tasks(search, demos, rows)
-        rows = run_all(best, folder, cluster, config.retry_failed, before=rows)
-    print(summary(SearchResults.of(rows)).to_string(index=False))
+        ended = known_rows(folder, config.retry_failed)
+        run_all(tasks, folder, cluster, ended)
+        if search.best_seeds:
+            run_all(best_tasks(search, demos, ended), folder, cluster, ended)
+    print(summary(SearchResults.of(together(ended))).to_string(index=False))
     print(f"\n{folder}: manifest.json, rows.csv; figures: python -m nht.recipes.report {config.folder}")
 
 
@@ -72,9 +81,9 @@ def search_tasks(search: SearchConfig, demos: Path) -> list[Task]:
     ]
 
 
-def best_tasks(search: SearchConfig, demos: Path, rows: pandas.DataFrame) -> list[Task]:
+def best_tasks(search: SearchConfig, demos: Path, ended: Rows) -> list[Task]:
     """The best configuration of each interface, on fresh seeds."""
-    results = SearchResults.of(rows)
+    results = SearchResults.of(together(ended))
     best = {interface: results.best(interface)[0] for interface in search.interfaces}
     return [
         make_task(search, demos, "best", interface, configuration, FRESH + seed, search.best_frames)
@@ -140,88 +149,88 @@ def task_env(search: SearchConfig) -> Any:
     return configure(schema, search.recipe, [f"env={search.env}", "map=none", *search.base]).env
 
 
-def run_all(
-    tasks: Sequence[Task],
-    folder: Path,
-    cluster: Cluster,
-    retry_failed: bool,
-    before: pandas.DataFrame | None,
-) -> pandas.DataFrame:
-    """Run those tasks that have not ended, and keep ``rows.csv`` up to date; its rows.
-
-    What stands in ``rows.csv`` already has ended, too: with the manifest it is all that another machine needs to go on.
+def run_all(tasks: Sequence[Task], folder: Path, cluster: Cluster, ended: Rows) -> None:
+    """Run those tasks of a stage that have not ended, and keep ``rows.csv`` up to date.
 
     Args:
         tasks: of one stage.
         folder: of the search.
         cluster: where they run.
-        retry_failed: whether those that failed before are run once more.
-        before: rows of an earlier stage, which stand first.
+        ended: the rows of all runs that have, which grows.
     """
-    if retry_failed:
-        forget_failures(tasks, folder)
-    ended = kept_rows(tasks, folder) | {
-        task.name: rows_of(task, folder) for task in tasks if Outcome.read(folder / task.name) is not None
+    ended |= {
+        task.name: rows_of(task, folder)
+        for task in tasks
+        if task.name not in ended and Outcome.read(folder / task.name) is not None
     }
-    with progress(tasks, folder, len(ended)) as show:
+    with progress(tasks, folder) as show:
+        show(ended)
         while missing := [task for task in tasks if task.name not in ended]:
             for task in cluster.run(run_task, missing, folder):
                 if Outcome.read(folder / task.name) is None:
                     continue  # another process is at it
                 ended[task.name] = rows_of(task, folder)
-                write_rows(folder, before, [ended[done.name] for done in tasks if done.name in ended])
+                write_rows(folder, ended)
                 show(ended)
-            if len(ended) < len(tasks):
+            if any(task.name not in ended for task in tasks):
                 time.sleep(POLL)
-    return write_rows(folder, before, [ended[task.name] for task in tasks])
-
-
-def kept_rows(tasks: Sequence[Task], folder: Path) -> dict[str, pandas.DataFrame]:
-    """The rows of those tasks that ``rows.csv`` has, by the task's name."""
-    if not (folder / "rows.csv").exists():
-        return {}
-    runs = read_results(folder / "rows.csv").rows.groupby(["stage", "interface", "configuration", "seed"])
-    known = {(task.stage, task.interface, task.configuration, task.seed): task.name for task in tasks}
-    return {known[place]: rows.dropna(axis="columns", how="all") for place, rows in runs if place in known}
-
-
-def forget_failures(tasks: Sequence[Task], folder: Path) -> None:
-    """Let those tasks that have failed begin anew."""
-    if (file := folder / "rows.csv").exists():
-        rows = pandas.read_csv(file)
-        rows[rows["status"] == "done"].to_csv(file, index=False)
-    for task in tasks:
-        outcome = Outcome.read(folder / task.name)
-        if outcome is not None and outcome.status != "done":
-            shutil.rmtree(folder / task.name)
+    write_rows(folder, ended)
 
 
 @contextmanager
-def progress(tasks: Sequence[Task], folder: Path, initial: int) -> Iterator[Any]:
+def progress(tasks: Sequence[Task], folder: Path) -> Iterator[Callable[[Rows], None]]:
     """A bar over the runs of a stage."""
-    stage = tasks[0].stage if tasks else "search"
-    with tqdm(total=len(tasks), initial=initial, desc=f"{folder.name}, {stage}", unit="run") as bar:
+    stage = tasks[0].stage
+    with tqdm(total=len(tasks), desc=f"{folder.name}, {stage}", unit="run") as bar:
 
-        def show(ended: dict[str, pandas.DataFrame]) -> None:
-            failed = sum(rows["status"].iloc[0] != "done" for rows in ended.values())
+        def show(ended: Rows) -> None:
+            own = [ended[task.name] for task in tasks if task.name in ended]
+            failed = sum(rows["status"].iloc[0] != "done" for rows in own)
             running = len(list((folder / "claims").glob(f"{stage}-*")))
             bar.set_postfix(failed=failed, running=running, refresh=False)
-            bar.update(len(ended) - bar.n)
+            if bar.n == 0:
+                bar.initial = len(own)  # what was there says nothing about the rate
+            bar.update(len(own) - bar.n)
 
         yield show
 
 
-def write_rows(
-    folder: Path, before: pandas.DataFrame | None, rows: Sequence[pandas.DataFrame]
-) -> pandas.DataFrame:
-    """Replace ``rows.csv``, whole or not at all; what stands in it now."""
-    parts = [part for part in (before, *rows) if part is not None]
-    together = pandas.concat([part.dropna(axis="columns", how="all") for part in parts], ignore_index=True)
-    columns = list(dict.fromkeys(name for part in parts for name in part.columns))
-    together = together.reindex(columns=columns)
+Rows = dict[str, pandas.DataFrame]
+"""The rows of runs that have ended, by the task's name."""
+
+
+def known_rows(folder: Path, retry_failed: bool) -> Rows:
+    """What ``rows.csv`` has: with the manifest it is all that another machine needs to go on.
+
+    With ``retry_failed``, runs that did not get to their end are forgotten.
+    """
+    if not (folder / "rows.csv").exists():
+        return {}
+    found = read_results(folder / "rows.csv").rows
+    known = {}
+    for place, rows in found.groupby(["stage", "interface", "configuration", "seed"], sort=False):
+        stage, interface, configuration, seed = cast(tuple[str, str, int, int], place)
+        name = task_name(stage, interface, configuration, seed)
+        if retry_failed and rows["status"].iloc[0] != "done":
+            shutil.rmtree(folder / name, ignore_errors=True)
+        else:
+            known[name] = rows.dropna(axis="columns", how="all")
+    return known
+
+
+def together(ended: Rows) -> pandas.DataFrame:
+    """All rows, in the order of stages, configurations and seeds, whichever ended first."""
+    rows = pandas.concat(list(ended.values()), ignore_index=True)
+    rows = rows.reindex(columns=[*COLUMNS, *sorted(set(rows.columns) - set(COLUMNS))])
+    late = rows["stage"].eq("best").rename("late")
+    order = rows.assign(late=late).sort_values(["late", "configuration", "seed", "interface", "frames"]).index
+    return rows.loc[order].reset_index(drop=True)
+
+
+def write_rows(folder: Path, ended: Rows) -> None:
+    """Replace ``rows.csv``, whole or not at all."""
     with replacing(folder / "rows.csv") as scratch:
-        together.to_csv(scratch, index=False)
-    return together
+        together(ended).to_csv(scratch, index=False)
 
 
 if __name__ == "__main__":

@@ -58,7 +58,12 @@ class Task:
     @property
     def name(self) -> str:
         """Of the run's folder, below the search's."""
-        return f"{self.stage}/{self.interface}/{self.configuration:03d}-seed{self.seed}"
+        return task_name(self.stage, self.interface, self.configuration, self.seed)
+
+
+def task_name(stage: str, interface: str, configuration: int, seed: int) -> str:
+    """By which a run is known."""
+    return f"{stage}/{interface}/{configuration:03d}-seed{seed}"
 
 
 @dataclass(frozen=True)
