@@ -159,4 +159,4 @@ def report(measured: dict[str, list[float]]) -> None:
 
 
 if __name__ == "__main__":
-    benchmark(int((sys.argv + ["5"])[1]))
+    benchmark(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
