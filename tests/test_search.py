@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pandas
 import pytest
 
+from nht.recipes import cluster as cluster_module
 from nht.recipes import search, search_tasks
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure
@@ -289,14 +290,20 @@ def test_on_ray_stopped_and_gone_on(tmp_path):
 
 
 @pytest.mark.slow
+def test_machines_without_the_package_or_with_another_one(monkeypatch):
+    monkeypatch.setattr(cluster_module, "version", lambda _: "9.9")
+    with pytest.raises(ImportError, match=r"has nht .*, this machine has 9\.9: install the same there"):
+        cluster_module.Cluster(num_workers=1)
+    assert not cluster_module.ray.is_initialized()
+
+
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(tmp_path):
     """The worker is killed once its first checkpoint is there; another one goes on from it."""
-    from nht.recipes.cluster import Cluster
-
     folder = tmp_path / "search"
     config = configure(Search, "search", [*SMOKE, "search.interfaces=[raw]", "search.total_frames=4000"])
     (run,) = search.search_tasks(config.search, tmp_path)
-    cluster = Cluster(num_workers=1)
+    cluster = cluster_module.Cluster(num_workers=1)
     try:
         finished = cluster.run(killed_once, [run], folder)
         assert [one.name for one in finished] == [run.name]
