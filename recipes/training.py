@@ -113,10 +113,8 @@ class TrainingRun:
     def collector(self, policy: TensorDictModuleBase, random_frames: int = 0) -> BaseCollector:
         """The collector of this process's batches ``(copies, steps)``, in which ``policy`` acts."""
         config = self._config
-        if self.ranks.rank:
-            torch.manual_seed(
-                self._seed
-            )  # the networks are made, alike in all processes; they explore differently
+        if self.ranks.rank:  # the networks are made, alike in all processes; exploration differs
+            torch.manual_seed(self._seed)
         self._policy = policy
         return make_collector(
             config.collector,
