@@ -8,39 +8,18 @@ import pytest
 import torch
 
 import nht.recipes.ppo
-from nht.recipes import ddpg, ppo
+import tiny_runs
 from nht.recipes.collecting import worker_seed
-from nht.recipes.config import DDPG, PPO, CollectorConfig
+from nht.recipes.config import DDPG, CollectorConfig
 from nht.recipes.launch import configure
 from nht.recipes.losses import estimate_advantages
 from nht.recipes.training import TrainingRun
 
-SETTINGS = [
-    "env=wam_wipe",
-    "map=none",
-    "env.num_envs=4",
-    "env.options.max_episode_steps=25",
-    "algo.total_frames=400",
-    "algo.frames_per_batch=100",
-    "algo.hidden=[16,16]",
-    "evaluation.every=400",
-    "evaluation.episodes=3",
-    "evaluation.video=false",
-    "run.checkpoint_every=200",
-    "run.wandb=false",
-]
-OWN = {
-    "ddpg": ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"],
-    "ppo": ["algo.minibatches=4", "algo.epochs=2"],
-}
-RECIPES = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}
+SETTINGS = ["algo.total_frames=400", "evaluation.every=400"]
 
 
 def train(algorithm, kind, folder, *overrides):
-    main, schema = RECIPES[algorithm]
-    settings = [*SETTINGS, *OWN[algorithm], f"collector={kind}", f"run.folder={folder}", *overrides]
-    main(configure(schema, algorithm, settings))
-    return pandas.read_csv(folder / "metrics.csv").drop(columns="seconds")
+    return tiny_runs.train(algorithm, folder, *SETTINGS, f"collector={kind}", *overrides)
 
 
 def assert_nothing_runs():
@@ -48,7 +27,7 @@ def assert_nothing_runs():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", RECIPES)
+@pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
 def test_workers_make_exactly_as_many_steps(algorithm, kind, tmp_path, monkeypatch):
     batches = []

@@ -12,39 +12,16 @@ import pytest
 import torch
 import yaml
 
+import tiny_runs
 import two_ranks
 from nht.recipes.ranks import Ranks
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-SETTINGS = [
-    "env=wam_wipe",
-    "map=none",
-    "env.num_envs=4",
-    "env.options.max_episode_steps=25",
-    "algo.frames_per_batch=100",
-    "algo.hidden=[16,16]",
-    "evaluation.every=200",
-    "evaluation.episodes=3",
-    "evaluation.video=false",
-    "run.checkpoint_every=200",
-    "run.wandb=false",
-]
-OWN = {
-    "ddpg": ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"],
-    "ppo": ["algo.minibatches=5", "algo.epochs=2"],
-}
 
 
 def command(algorithm, folder, *overrides, launcher=()):
-    recipe = [
-        "-m",
-        f"nht.recipes.{algorithm}",
-        *SETTINGS,
-        *OWN[algorithm],
-        f"run.folder={folder}",
-        *overrides,
-    ]
-    return [*TORCHRUN, *launcher, *recipe]
+    told = tiny_runs.settings(algorithm, folder, "evaluation.every=200", *overrides)
+    return [*TORCHRUN, *launcher, "-m", f"nht.recipes.{algorithm}", *told]
 
 
 def run(*arguments, **options):

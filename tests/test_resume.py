@@ -12,36 +12,16 @@ import pytest
 from torchrl.checkpoint import Checkpoint
 
 import fresh_process
-from nht.recipes import ddpg, ppo
-from nht.recipes.config import DDPG, PPO, RunConfig
-from nht.recipes.launch import configure
+import tiny_runs
+from nht.recipes.config import RunConfig
 from nht.recipes.run_folder import RunFolder
 from nht.recipes.training import TrainingRun
 
-SHARED = [
-    "env=wam_wipe",
-    "map=none",
-    "env.num_envs=4",
-    "env.options.max_episode_steps=25",
-    "algo.total_frames=600",
-    "algo.frames_per_batch=100",
-    "algo.hidden=[16,16]",
-    "evaluation.every=300",
-    "evaluation.episodes=3",
-    "evaluation.video=false",
-    "run.checkpoint_every=200",
-    "run.wandb=false",
-]
-OWN = {
-    "ddpg": ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"],
-    "ppo": ["algo.minibatches=4", "algo.epochs=2"],
-}
+SETTINGS = ["algo.total_frames=600", "evaluation.every=300"]
 
 
 def train(algorithm: str, folder: Path, *overrides: str) -> pandas.DataFrame:
-    main, schema = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}[algorithm]
-    main(configure(schema, algorithm, [*SHARED, *OWN[algorithm], f"run.folder={folder}", *overrides]))
-    return pandas.read_csv(folder / "metrics.csv").drop(columns="seconds")
+    return tiny_runs.train(algorithm, folder, *SETTINGS, *overrides)
 
 
 @pytest.fixture(scope="module", params=["ddpg", "ppo"])
