@@ -83,11 +83,10 @@ class TrainingRun:
         self._stopping = False
 
     def _open_folder(self) -> RunFolder:
-        run = self._config.run
+        config: Training = self._config
+        run = config.run
         # Processes that torchrun starts anew find the run that they were in.
-        return RunFolder(
-            replace(run, resume=run.resume or "auto") if self.ranks.restarts else run, self._config
-        )
+        return RunFolder(replace(run, resume=run.resume or "auto") if self.ranks.restarts else run, config)
 
     def _shared_map(self) -> nht.ActionMap:
         """The run's map, which the first process gets ready."""
@@ -102,17 +101,18 @@ class TrainingRun:
         return worker_seed(self._config.seed, self.ranks.rank) if self.ranks.rank else self._config.seed
 
     def _copies_per_worker(self) -> int:
-        workers = self._config.collector.num_workers
+        config: Training = self._config
+        workers = config.collector.num_workers
         if self.copies % workers:
             raise ValueError(
                 f"collector.num_workers={workers} cannot share alike the {self.copies} copies that "
-                f"env.num_envs={self._config.env.num_envs} leaves each of {self.ranks.size} processes."
+                f"env.num_envs={config.env.num_envs} leaves each of {self.ranks.size} processes."
             )
         return self.copies // workers
 
     def collector(self, policy: TensorDictModuleBase, random_frames: int = 0) -> BaseCollector:
         """The collector of this process's batches ``(copies, steps)``, in which ``policy`` acts."""
-        config = self._config
+        config: Training = self._config
         if self.ranks.rank:  # the networks are made, alike in all processes; exploration differs
             torch.manual_seed(self._seed)
         self._policy = policy
@@ -147,6 +147,7 @@ class TrainingRun:
             OSError: if there is no room for a checkpoint; earlier ones stay as they are.
             SystemExit: after the last checkpoint, if the process was told to end.
         """
+        config: Training = self._config
         before: Any = None
         try:
             self._collector = collector
@@ -158,7 +159,7 @@ class TrainingRun:
                 before = signal.signal(signal.SIGTERM, self._stop)
             self._before = before
             self._progress = tqdm(
-                total=self._config.algo.total_frames,
+                total=config.algo.total_frames,
                 initial=self.counters.frames,
                 desc=self._path.name,
                 unit="step",
@@ -192,6 +193,7 @@ class TrainingRun:
 
     def _go_on(self) -> None:
         """Load the newest checkpoint that all processes have."""
+        config: Training = self._config
         made_by = len(list((self._path / "checkpoints").glob("rank-*"))) or 1
         if made_by != self.ranks.size and (self._path / "checkpoints").exists():
             raise ValueError(
@@ -200,7 +202,7 @@ class TrainingRun:
         common = set.intersection(*map(set, self.ranks.gather(self._checkpoints.steps())))
         if common:
             self._checkpoints.load(max(common))
-        elif self._config.run.resume is True:
+        elif config.run.resume is True:
             raise FileNotFoundError(f"{self._path} holds no checkpoint to resume from.")
         if self.finished and (self._path / "policy.safetensors").exists():
             raise ValueError(
@@ -222,8 +224,9 @@ class TrainingRun:
             self._save_if_due()
 
     def _save_if_due(self) -> None:
+        config: Training = self._config
         self._stopping = self.ranks.any(self._stopping)
-        if self._stopping or self.counters.frames % self._config.run.checkpoint_every == 0:
+        if self._stopping or self.counters.frames % config.run.checkpoint_every == 0:
             self._checkpoints.save(self.counters.frames)
         if self._stopping and not self.finished:
             self._progress.close()
@@ -251,7 +254,8 @@ class TrainingRun:
     @property
     def evaluation_due(self) -> bool:
         """Whether it is time to test the policy."""
-        return self.counters.frames % self._config.evaluation.every == 0
+        config: Training = self._config
+        return self.counters.frames % config.evaluation.every == 0
 
     def log(self, outcome: Evaluation) -> None:
         """Write a row of metrics: the training of all processes since the last one, and an evaluation."""
@@ -266,15 +270,17 @@ class TrainingRun:
     @property
     def finished(self) -> bool:
         """Whether all steps are made."""
-        return self.counters.frames >= self._config.algo.total_frames
+        config: Training = self._config
+        return self.counters.frames >= config.algo.total_frames
 
     def finish(self, policy: TensorDictModuleBase) -> None:
         """Save and film the policy, close everything, and say what happened."""
+        config: Training = self._config
         self.tests.close()
         self._progress.close()
         if self._folder is not None:
             save_policy(policy, self._path)
-            if self._config.evaluation.video:
+            if config.evaluation.video:
                 self._film(policy)
             self._folder.finish()
         self.ranks.part()
