@@ -33,7 +33,7 @@ from nht.recipes.search_tasks import (
     run_task,
     task_name,
 )
-from nht.recipes.train_map import KINDS
+from nht.recipes.train_map import ARMS, KINDS
 from nht.storage import replacing
 
 FRESH = 100
@@ -63,12 +63,16 @@ def main(config: Search) -> None:
 
 
 def check_interfaces(search: SearchConfig) -> None:
-    """Raise ValueError for an interface that does not exist."""
+    """Raise ValueError for an interface that does not exist, or not on the task."""
     known = ["raw", *sorted(KINDS.keys() - {"none"})]
     if unknown := [name for name in search.interfaces if name not in known]:
         raise ValueError(f"unknown search.interfaces {unknown}: choose from {known}.")
     if not search.interfaces:
         raise ValueError(f"search.interfaces is empty: choose from {known}.")
+    if "jacobian" in search.interfaces and search.env not in ARMS:
+        raise ValueError(
+            f"the interface jacobian needs an arm: {sorted(ARMS)} have one, {search.env!r} does not."
+        )
 
 
 def search_tasks(search: SearchConfig, demos: Path) -> list[Task]:

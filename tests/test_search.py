@@ -252,6 +252,14 @@ def test_mistakes_are_told_before_anything_runs(override, message, tmp_path):
     assert not list(tmp_path.rglob("train.log"))
 
 
+def test_the_jacobian_needs_an_arm():
+    config = configure(Search, "search", ["search=half_cheetah", "search.interfaces=[jacobian]"])
+    with pytest.raises(
+        ValueError, match=r"jacobian needs an arm: \['wam_grasp', 'wam_wipe'\] have one, 'half_ch"
+    ):
+        search.main(config)
+
+
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
