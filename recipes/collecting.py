@@ -42,21 +42,18 @@ def make_collector(
         seed: that the workers' seeds come from.
         random_frames: the first ones, whose actions are uniform.
     """
-    settings = {"frames_per_batch": frames_per_batch, "total_frames": -1, "init_random_frames": random_frames}
+    settings = {
+        "frames_per_batch": frames_per_batch,
+        "total_frames": -1,
+        "init_random_frames": random_frames,
+        "device": env.device,  # said aloud, it saves a cast in every step
+        "auto_register_policy_transforms": True,
+    }
     if config.kind == "single":
-        # Said aloud, the device saves a cast in every step.
-        return Collector(
-            env,
-            policy,
-            **settings,
-            track_traj_ids=False,
-            device=env.device,
-            auto_register_policy_transforms=True,
-        )
+        return Collector(env, policy, **settings, track_traj_ids=False)
     makers = [
         partial(_in_worker, make_env, worker_seed(seed, worker)) for worker in range(config.num_workers)
     ]
-    settings |= {"device": env.device, "auto_register_policy_transforms": True}
     if config.kind == "multi_sync":
         return MultiSyncCollector(makers, policy, **settings, cat_results=0)
     return FirstComeCollector(makers, policy, **settings)

@@ -61,9 +61,9 @@ def counts(results: SearchResults) -> str:
     return f"{text}. Score: {results.metric} of the test episodes after the last step. Intervals: 95 %, bootstrap."
 
 
-def summary(results: SearchResults, seed: int = 0) -> pandas.DataFrame:
+def summary(results: SearchResults) -> pandas.DataFrame:
     """A row per interface: how it does over configurations, and at its best."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     digits = ".3f" if results.metric == "success" else ",.0f"
     rows = []
     for interface in results.interfaces:
@@ -72,8 +72,7 @@ def summary(results: SearchResults, seed: int = 0) -> pandas.DataFrame:
         flat = again.reshape(len(again), -1)
         low, high = percentiles(interquartile_mean(flat, axis=1))
         number, _, fresh = results.best(interface)
-        fresh_scores = _fresh_scores(results, interface)
-        best = fresh_scores if fresh else scores[scores.mean(1).argmax()]
+        best = _scores_of(results, interface, number, "best" if fresh else "search")
         ends = interval(best)
         rows.append(
             {
@@ -89,18 +88,21 @@ def summary(results: SearchResults, seed: int = 0) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def _fresh_scores(results: SearchResults, interface: str) -> Scores:
-    runs = results.stage("best")
-    return runs[runs["interface"] == interface]["score"].to_numpy(dtype=float)
+def _scores_of(results: SearchResults, interface: str, configuration: int, stage: str) -> Scores:
+    runs = results.stage(stage)
+    own = (runs["interface"] == interface) & (runs["configuration"] == configuration)
+    return runs[own]["score"].to_numpy(dtype=float)
 
 
 def _improvement(results: SearchResults, interface: str, rng: np.random.Generator) -> str:
     """The probability that ours beats an interface, with its interval, over the configurations that both have."""
     if interface == OURS or OURS not in results.interfaces:
         return "-"
-    ours, theirs = results.scores(OURS), results.scores(interface)
-    if len(ours) != len(theirs):
-        return "configurations differ"
+    tables = results.table(OURS), results.table(interface)
+    both = tables[0].index.intersection(tables[1].index)
+    if both.empty:
+        return "no configuration in common"
+    ours, theirs = (table.loc[both].to_numpy() for table in tables)
     found = float(probability_of_improvement(ours, theirs))
     # The same configurations on both sides: they share the agent's hyperparameters.
     drawn = rng.integers(len(ours), size=(500, len(ours)))

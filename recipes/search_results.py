@@ -67,19 +67,20 @@ class SearchResults:
         """The runs of a stage."""
         return self.runs[self.runs["stage"] == stage]
 
-    def scores(self, interface: str) -> Scores:
-        """Final scores of the search, ``(configurations, seeds)``, of the configurations that all seeds have."""
+    def table(self, interface: str) -> pandas.DataFrame:
+        """Final scores of the search: a row per configuration that has all seeds, a column per seed."""
         runs = self.stage("search")
-        table = runs[runs["interface"] == interface].pivot(
-            index="configuration", columns="seed", values="score"
-        )
-        return table.dropna().to_numpy()
+        own = runs[runs["interface"] == interface]
+        return own.pivot(index="configuration", columns="seed", values="score").dropna()
+
+    def scores(self, interface: str) -> Scores:
+        """The same, ``(configurations, seeds)``."""
+        return self.table(interface).to_numpy()
 
     def best(self, interface: str) -> tuple[int, pandas.DataFrame, bool]:
         """The configuration with the best mean, the evaluations of its runs, and whether these are on fresh seeds."""
-        runs = self.stage("search")
-        means = runs[runs["interface"] == interface].groupby("configuration")["score"].mean()
-        number = int(means.index.to_numpy()[means.to_numpy().argmax()])
+        table = self.table(interface)
+        number = int(table.index.to_numpy()[table.to_numpy().mean(1).argmax()])
         of_it = self.rows[(self.rows["interface"] == interface) & (self.rows["configuration"] == number)]
         fresh = of_it[of_it["stage"] == "best"]
         return number, (fresh if len(fresh) else of_it[of_it["stage"] == "search"]), bool(len(fresh))

@@ -124,8 +124,8 @@ def quantile(seed: int, configuration: int, name: str) -> float:
     return float(np.random.default_rng([seed, configuration, crc32(name.encode())]).random())
 
 
-def write_manifest(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """The search's manifest: the one that is there, which must be of the same search, else a new one.
+def write_manifest(path: Path, settings: dict[str, Any]) -> None:
+    """Write the search's manifest; one that is there already must be of the same search.
 
     Args:
         path: of the JSON file.
@@ -139,7 +139,6 @@ def write_manifest(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
         _check_same(path, json.loads(path.read_text()), manifest)
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(manifest, indent=1))
-    return manifest
 
 
 def _check_same(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:

@@ -100,6 +100,30 @@ def test_a_report_of_nothing(tmp_path):
         report.main(Report(folder=str(tmp_path)))
 
 
+def test_only_fresh_runs_of_the_configuration_that_is_best_now_count():
+    rows = toy_search.rows()
+    fresh = (rows["stage"] == "best") & (rows["interface"] == "nht")
+    formerly = rows[fresh].assign(configuration=0, eval_success=0.0)
+    before, after = (
+        summary(SearchResults.of(found)).set_index("interface").loc["nht"]
+        for found in (rows, pandas.concat([rows, formerly], ignore_index=True))
+    )
+    assert before["best configuration"] != 0
+    assert (after["its score"], after["on"]) == (before["its score"], before["on"])
+
+
+def test_interfaces_are_compared_over_the_configurations_that_both_have():
+    rows = toy_search.rows(4, 2, best_seeds=0)
+    ours, theirs = rows["interface"] == "nht", rows["interface"] == "svd"
+    lacking = rows[~(ours & (rows["configuration"] == 0)) & ~(theirs & (rows["configuration"] == 3))]
+    common = rows[~((ours | theirs) & rows["configuration"].isin([0, 3]))]
+    found, expected = (
+        summary(SearchResults.of(some)).set_index("interface").loc["svd", "P(nht better)"].split()[0]
+        for some in (lacking, common)
+    )
+    assert found == expected
+
+
 def test_growing_rows_of_a_search_that_still_runs():
     rows = toy_search.rows(4, 3, best_seeds=0)
     unfinished = rows[~((rows["configuration"] == 3) & (rows["seed"] == 2))]
