@@ -49,7 +49,7 @@ from nht.recipes.ppo import main
 
 GYMNASIUM = {"half_cheetah": "HalfCheetah-v5", "wam_wipe": "nht/WAMWipe-v0"}
 STEPS, EPOCHS, MINIBATCHES, COPIES, HIDDEN = 2_048, 10, 32, 16, [64, 64]
-SHORT, LONG = 2, 6  # iterations of the recipe
+SHORT, LONG = 2, 10  # iterations of the recipe
 GAMMA, LAMBDA, CLIP, RATE, MAX_NORM = 0.99, 0.95, 0.2, 3e-4, 0.5
 Iteration = Callable[[], object]
 
