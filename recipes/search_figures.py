@@ -63,7 +63,7 @@ def colour(interface: str) -> str:
 
 
 def _line(interface: str) -> dict[str, Any]:
-    """The first interface, which the others are compared with, is still seen beneath those that end as high."""
+    """How its curve is drawn: ours is wide, to be seen beneath others that end as high."""
     return {"color": colour(interface), "linewidth": 3.0 if interface == "nht" else 1.5}
 
 
