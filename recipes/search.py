@@ -191,10 +191,10 @@ def progress(tasks: Sequence[Task], folder: Path) -> Iterator[Callable[[Rows], N
             own = [ended[task.name] for task in tasks if task.name in ended]
             failed = sum(rows["status"].iloc[0] != "done" for rows in own)
             running = len(list((folder / "claims").glob(f"{stage}-*")))
-            bar.set_postfix(failed=failed, running=running, refresh=False)
             if bar.n == 0:
                 bar.initial = len(own)  # what was there says nothing about the rate
             bar.update(len(own) - bar.n)
+            bar.set_postfix(failed=failed, running=running)  # drawn at once, also right after the start
 
         yield show
 
