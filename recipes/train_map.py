@@ -6,6 +6,7 @@ python -m nht.recipes.train_map map=nht demos.path=runs/demos-wam_wipe
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
@@ -127,9 +128,11 @@ def make_map(
         return nht.LASER(*sizes, beta_kl=map.beta_kl, beta_dynamics=map.beta_dynamics, seed=seed)
     if map.kind == "cae":
         return nht.CAE(*sizes, seed=seed)
-    if map.kind == "scl":
-        return nht.SCL(*sizes, lipschitz=map.lipschitz, seed=seed)
-    return nht.NHT(*sizes, lipschitz=map.lipschitz, multi_head=map.multi_head, seed=seed)
+    make = nht.SCL if map.kind == "scl" else partial(nht.NHT, multi_head=map.multi_head)
+    limit = map.lipschitz
+    if limit is not None and map.lipschitz_per_layer:
+        limit = make(*sizes).network_gain * limit ** (len(map.hidden) + 1)
+    return make(*sizes, lipschitz=limit, seed=seed)
 
 
 def _jacobian(env: EnvConfig) -> nht.JacobianPinv:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import nht
+from nht.lipschitz import LipschitzProjection
 from nht.recipes import collect_demos, ddpg, evaluate, report, train_map
 from nht.recipes.config import DDPG, CollectDemos, Evaluate, Report, TrainMap
 from nht.recipes.launch import configure
@@ -291,6 +292,17 @@ def test_a_lipschitz_limit_for_a_map_that_has_none():
     config = configure(TrainMap, "train_map", ["map=laser", "map.lipschitz=2", "out=unused"])
     with pytest.raises(ValueError, match=r"map.lipschitz limits nht and scl, there is no limit for 'laser'"):
         train_map.make_map(config.map, 10, 7, 0)
+
+
+@pytest.mark.parametrize(("kind", "gain"), [("nht", 2 * 3**0.5), ("scl", 1.0)])
+def test_a_lipschitz_limit_of_every_layer(kind, gain):
+    told = [f"map={kind}", "map.action_dim=3", "map.hidden=[16,16]", "map.lipschitz=0.5", "out=unused"]
+    whole = configure(TrainMap, "train_map", told)
+    each = configure(TrainMap, "train_map", [*told, "map.lipschitz_per_layer=true"])
+    assert train_map.make_map(whole.map, 10, 7, seed=0).init_args()["lipschitz"] == 0.5
+    map = train_map.make_map(each.map, 10, 7, seed=0)
+    assert map.init_args()["lipschitz"] == pytest.approx(gain * 0.5**3)  # two hidden layers and the last
+    assert LipschitzProjection(map).limits == pytest.approx([0.5] * 3, rel=1e-5)  # tanh is no steeper than 1
 
 
 def test_an_unknown_option_of_the_task(tmp_path):
