@@ -56,7 +56,7 @@ class MapConfig:
     activation: str = "tanh"
     multi_head: bool = False  # nht: each reflection has a last hidden layer of its own
     lipschitz: float | None = None  # bound L on the whole map; None leaves it free
-    lipschitz_per_layer: bool = False  # a bound bounds each layer of the network instead
+    lipschitz_per_layer: bool = False  # L bounds each layer instead, if there is a bound
     learning_rate: float = 1e-3
     batch_size: int = 256
     max_steps: int = 6_000

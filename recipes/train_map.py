@@ -130,7 +130,7 @@ def make_map(
         return nht.CAE(*sizes, seed=seed)
     make = nht.SCL if map.kind == "scl" else partial(nht.NHT, multi_head=map.multi_head)
     limit = map.lipschitz
-    if limit is not None and map.lipschitz_per_layer:
+    if limit is not None and map.lipschitz_per_layer:  # constants of a composition multiply
         limit = make(*sizes).network_gain * limit ** (len(map.hidden) + 1)
     return make(*sizes, lipschitz=limit, seed=seed)
 
