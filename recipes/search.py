@@ -185,7 +185,8 @@ def run_all(tasks: Sequence[Task], folder: Path, cluster: Cluster, ended: Rows) 
 def progress(tasks: Sequence[Task], folder: Path) -> Iterator[Callable[[Rows], None]]:
     """A bar over the runs of a stage."""
     stage = tasks[0].stage
-    with tqdm(total=len(tasks), desc=f"{folder.name}, {stage}", unit="run") as bar:
+    # The mean rate, not the latest: runs of one configuration end together, and configurations differ.
+    with tqdm(total=len(tasks), desc=f"{folder.name}, {stage}", unit="run", smoothing=0) as bar:
 
         def show(ended: Rows) -> None:
             own = [ended[task.name] for task in tasks if task.name in ended]
