@@ -19,12 +19,12 @@ from taking_turns import commit
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from nht.recipes.checkpoints import Checkpoints
+from nht.recipes.agents.losses import PaperDDPGLoss
+from nht.recipes.agents.networks import ddpg_networks
 from nht.recipes.config import DDPG
-from nht.recipes.environments import base_env
 from nht.recipes.launch import configure
-from nht.recipes.losses import PaperDDPGLoss
-from nht.recipes.networks import ddpg_networks
+from nht.recipes.run.checkpoints import Checkpoints
+from nht.recipes.run.environments import base_env
 
 TRANSITIONS, PARTS = 1_000_000, 10
 

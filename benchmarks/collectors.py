@@ -23,11 +23,11 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector
 
 import nht
-from nht.recipes.collecting import make_collector
+from nht.recipes.agents.networks import ppo_networks
 from nht.recipes.config import PPO, CollectorConfig
-from nht.recipes.environments import base_env, mapped_env
 from nht.recipes.launch import configure
-from nht.recipes.networks import ppo_networks
+from nht.recipes.run.collecting import make_collector
+from nht.recipes.run.environments import base_env, mapped_env
 
 TASKS = {
     "half_cheetah": ["env=half_cheetah", "env.num_envs=64"],

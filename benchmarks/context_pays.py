@@ -22,7 +22,7 @@ import torch
 import nht
 from nht.envs import make_expert, make_task
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
-from nht.recipes.recording import record_expert
+from nht.recipes.data.recording import record_expert
 from nht.recipes.train_map import make_map
 
 CONTEXT = ["tool_position", "joint_angle"]

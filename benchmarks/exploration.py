@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 import nht
 from nht.envs import make_task
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
-from nht.recipes.recording import record_expert
+from nht.recipes.data.recording import record_expert
 from nht.recipes.train_map import make_map
 
 ACTION_DIMS = {"wam_grasp": 3, "wam_wipe": 2}

@@ -21,7 +21,7 @@ from tensordict import TensorDict
 
 import nht
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
-from nht.recipes.recording import record_expert
+from nht.recipes.data.recording import record_expert
 from nht.recipes.train_map import train_map
 from nht.train import _gradient_steps
 

@@ -42,9 +42,9 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import nht.envs
+from nht.recipes.agents.networks import orthogonal
 from nht.recipes.config import PPO
 from nht.recipes.launch import configure
-from nht.recipes.networks import orthogonal
 from nht.recipes.ppo import main
 
 GYMNASIUM = {"half_cheetah": "HalfCheetah-v5", "wam_wipe": "nht/WAMWipe-v0"}

@@ -24,8 +24,8 @@ import torch
 
 import nht
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
-from nht.recipes.environments import mapped_env
-from nht.recipes.recording import record_expert
+from nht.recipes.data.recording import record_expert
+from nht.recipes.run.environments import mapped_env
 from nht.recipes.train_map import train_map
 
 ENV = EnvConfig(context_keys=["tool_position", "joint_angle"])

@@ -25,12 +25,12 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import nht
+from nht.recipes.agents.losses import JointSoftUpdate, PaperDDPGLoss, n_step_returns
+from nht.recipes.agents.networks import ddpg_networks, exploring
 from nht.recipes.config import DDPG
 from nht.recipes.ddpg import STORED, main
-from nht.recipes.environments import mapped_env
 from nht.recipes.launch import configure
-from nht.recipes.losses import JointSoftUpdate, PaperDDPGLoss, n_step_returns
-from nht.recipes.networks import ddpg_networks, exploring
+from nht.recipes.run.environments import mapped_env
 
 ROUNDS = 4
 SHORT, LONG = 2_000, 6_000  # frames

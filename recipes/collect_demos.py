@@ -18,13 +18,13 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import nht
 from nht.envs import make_env
 from nht.envs.registry import TASKS
+from nht.recipes.agents.networks import load_policy
 from nht.recipes.config import CollectDemos, DemosConfig, EnvConfig, SourceConfig
-from nht.recipes.demo_files import FILES, best_episodes, read_episodes
-from nht.recipes.environments import mapped_env
+from nht.recipes.data.files import FILES, best_episodes, read_episodes
+from nht.recipes.data.recording import COPIES, endings, has_success, record, record_expert
 from nht.recipes.launch import launch
-from nht.recipes.networks import load_policy
-from nht.recipes.recording import COPIES, endings, has_success, record, record_expert
-from nht.recipes.run_folder import read_config
+from nht.recipes.run.environments import mapped_env
+from nht.recipes.run.folder import read_config
 
 
 def main(config: CollectDemos) -> None:

@@ -20,7 +20,7 @@ import torch
 import nht
 from nht.recipes.config import CompareMaps
 from nht.recipes.launch import launch
-from nht.recipes.map_figures import basis_figure, tool_figure
+from nht.recipes.maps.figures import basis_figure, tool_figure
 from nht.recipes.train_map import ARMS, KINDS, arm_of, train_map
 
 FIXED = ("jacobian", "none")  # kinds whose action has the width it has

@@ -10,13 +10,19 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from nht.recipes.agents.losses import (
+    JointSoftUpdate,
+    PaperDDPGLoss,
+    charge_failure,
+    n_step_returns,
+    reward_range,
+)
+from nht.recipes.agents.networks import ddpg_networks, exploring
 from nht.recipes.config import DDPG
-from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
-from nht.recipes.losses import JointSoftUpdate, PaperDDPGLoss, charge_failure, n_step_returns, reward_range
-from nht.recipes.networks import ddpg_networks, exploring
-from nht.recipes.ranks import Ranks
-from nht.recipes.training import TrainingRun
+from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.training import TrainingRun
 
 STORED = (
     "observation",

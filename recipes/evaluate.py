@@ -11,13 +11,13 @@ from pathlib import Path
 from torchrl.envs import TransformedEnv
 
 import nht
+from nht.recipes.agents.networks import load_policy
 from nht.recipes.config import Evaluate
-from nht.recipes.environments import lasting_failures, mapped_env
-from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
-from nht.recipes.networks import load_policy
-from nht.recipes.run_folder import read_config
-from nht.recipes.video import record_video
+from nht.recipes.run.environments import lasting_failures, mapped_env
+from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.folder import read_config
+from nht.recipes.run.video import record_video
 
 
 def main(config: Evaluate) -> None:

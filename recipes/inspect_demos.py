@@ -25,7 +25,7 @@ from tensordict import TensorDictBase
 import nht
 from nht.episodes import items, key_name
 from nht.recipes.config import InspectDemos, SourceConfig
-from nht.recipes.demo_files import Episodes, episode_returns, read_episodes
+from nht.recipes.data.files import Episodes, episode_returns, read_episodes
 from nht.recipes.launch import launch
 
 BINS = 30

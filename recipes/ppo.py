@@ -11,13 +11,13 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.objectives.value import GAE
 
+from nht.recipes.agents.losses import GaussianPPOLoss, charge_failure, estimate_advantages, reward_range
+from nht.recipes.agents.networks import ReturnNorm, ppo_networks
 from nht.recipes.config import PPO
-from nht.recipes.evaluation import evaluate
 from nht.recipes.launch import launch
-from nht.recipes.losses import GaussianPPOLoss, charge_failure, estimate_advantages, reward_range
-from nht.recipes.networks import ReturnNorm, ppo_networks
-from nht.recipes.ranks import Ranks
-from nht.recipes.training import TrainingRun
+from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.training import TrainingRun
 
 LEARNED_FROM = ("features", "sample", "sample_log_prob", "state_value", "advantage", "value_target")
 

@@ -18,9 +18,9 @@ import pandas
 
 from nht.recipes.config import Report
 from nht.recipes.launch import launch
-from nht.recipes.run_folder import read_config
-from nht.recipes.scores import interquartile_mean, interval
-from nht.recipes.search_report import to_markdown, write_report
+from nht.recipes.run.folder import read_config
+from nht.recipes.study.report import to_markdown, write_report
+from nht.recipes.study.scores import interquartile_mean, interval
 
 
 def main(config: Report) -> None:

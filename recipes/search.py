@@ -17,14 +17,11 @@ from typing import Any, cast
 import pandas
 from tqdm import tqdm
 
-from nht.recipes.cluster import Cluster
 from nht.recipes.config import Search, SearchConfig
+from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import configure, launch
-from nht.recipes.recording import record_expert
-from nht.recipes.search_report import summary
-from nht.recipes.search_results import COLUMNS, SearchResults, read_results
-from nht.recipes.search_space import draw, write_manifest
-from nht.recipes.search_tasks import (
+from nht.recipes.study.cluster import Cluster
+from nht.recipes.study.jobs import (
     RECIPES,
     Outcome,
     Task,
@@ -33,6 +30,9 @@ from nht.recipes.search_tasks import (
     run_task,
     task_name,
 )
+from nht.recipes.study.report import summary
+from nht.recipes.study.results import COLUMNS, SearchResults, read_results
+from nht.recipes.study.space import draw, write_manifest
 from nht.recipes.train_map import ARMS, KINDS
 from nht.storage import replacing
 

@@ -18,8 +18,8 @@ import nht
 from nht.envs import wam_kinematics
 from nht.networks import Activation
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
+from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import launch
-from nht.recipes.recording import record_expert
 
 KINDS: dict[str, type[nht.ActionMap]] = {
     "nht": nht.NHT,

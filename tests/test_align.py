@@ -16,7 +16,7 @@ from nht.envs import make_env
 from nht.envs.wam_kinematics import forward_kinematics
 from nht.maps import ActionMap, LinearActionMap
 from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
-from nht.recipes.recording import record_expert
+from nht.recipes.data.recording import record_expert
 from nht.recipes.train_map import load_kind, train_map
 from nht.train import projection_error
 from nht.transforms import ActionMapTransform

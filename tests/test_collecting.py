@@ -9,11 +9,11 @@ import torch
 
 import nht.recipes.ppo
 import tiny_runs
-from nht.recipes.collecting import worker_seed
+from nht.recipes.agents.losses import estimate_advantages
 from nht.recipes.config import DDPG, CollectorConfig
 from nht.recipes.launch import configure
-from nht.recipes.losses import estimate_advantages
-from nht.recipes.training import TrainingRun
+from nht.recipes.run.collecting import worker_seed
+from nht.recipes.run.training import TrainingRun
 
 SETTINGS = ["algo.total_frames=400", "evaluation.every=400"]
 

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import nht
-from nht.recipes import collect_demos, compare_maps, map_figures
+from nht.recipes import collect_demos, compare_maps
 from nht.recipes.config import CollectDemos, CompareMaps
 from nht.recipes.launch import configure
+from nht.recipes.maps import figures as map_figures
 from nht.recipes.train_map import arm_of
 
 KINDS = ["nht", "laser", "cae", "svd", "scl", "jacobian", "none"]

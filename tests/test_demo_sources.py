@@ -14,12 +14,12 @@ from torchrl.data.datasets import D4RLExperienceReplay
 import nht
 import nht.envs
 from nht.recipes import collect_demos, ddpg
+from nht.recipes.agents.networks import load_policy
 from nht.recipes.config import DDPG, CollectDemos, DemosConfig
-from nht.recipes.environments import mapped_env
+from nht.recipes.data.recording import endings, has_success, record
 from nht.recipes.launch import configure
-from nht.recipes.networks import load_policy
-from nht.recipes.recording import endings, has_success, record
-from nht.recipes.run_folder import read_config
+from nht.recipes.run.environments import mapped_env
+from nht.recipes.run.folder import read_config
 from toy_demos import CONTEXT, FLAGS, LENGTHS, as_rollout, demonstrations, episodes, same, write_hdf5
 
 

@@ -15,10 +15,10 @@ from torchrl.envs.utils import check_env_specs
 import nht
 from nht.envs import foreign, make_dm_control
 from nht.recipes import ddpg, evaluate
+from nht.recipes.agents.losses import reward_range
 from nht.recipes.config import DDPG, EnvConfig, Evaluate
-from nht.recipes.environments import base_env, mapped_env
 from nht.recipes.launch import configure
-from nht.recipes.losses import reward_range
+from nht.recipes.run.environments import base_env, mapped_env
 from nht.transforms import ActionMapTransform
 
 # Flat entries, a matrix among them, a target that moves in the model, and a task without time limit or reward bounds.

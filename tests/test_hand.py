@@ -11,10 +11,10 @@ from torchrl.envs.utils import check_env_specs
 
 import nht
 from nht.envs import make_gymnasium
+from nht.recipes.agents.losses import reward_range
 from nht.recipes.config import DDPG, EnvConfig
-from nht.recipes.environments import mapped_env, raw_actuation
 from nht.recipes.launch import configure
-from nht.recipes.losses import reward_range
+from nht.recipes.run.environments import mapped_env, raw_actuation
 
 SIZES = {"AdroitHandRelocate-v1": (39, 30), "AdroitHandDoor-v1": (39, 28)}
 

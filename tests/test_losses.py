@@ -11,8 +11,7 @@ from torch import nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from nht.envs import make_env
-from nht.recipes.config import DDPGConfig
-from nht.recipes.losses import (
+from nht.recipes.agents.losses import (
     JointSoftUpdate,
     PaperDDPGLoss,
     charge_failure,
@@ -20,7 +19,8 @@ from nht.recipes.losses import (
     return_range,
     reward_range,
 )
-from nht.recipes.networks import RunningNorm, ddpg_networks
+from nht.recipes.agents.networks import RunningNorm, ddpg_networks
+from nht.recipes.config import DDPGConfig
 
 GAMMA = 0.9
 

@@ -10,10 +10,10 @@ import torch
 import nht
 import nht.envs
 from nht.recipes import ddpg, evaluate, ppo
+from nht.recipes.agents.losses import GaussianPPOLoss
 from nht.recipes.config import DDPG, PPO, Evaluate
 from nht.recipes.launch import configure
-from nht.recipes.losses import GaussianPPOLoss
-from nht.recipes.run_folder import RunFolder, read_config
+from nht.recipes.run.folder import RunFolder, read_config
 
 TINY = [
     "env=wam_wipe",

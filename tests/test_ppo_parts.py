@@ -19,9 +19,9 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from nht.envs import make_env
+from nht.recipes.agents.losses import GaussianPPOLoss, estimate_advantages
+from nht.recipes.agents.networks import GaussianActor, ReturnNorm, ppo_networks
 from nht.recipes.config import PPOConfig
-from nht.recipes.losses import GaussianPPOLoss, estimate_advantages
-from nht.recipes.networks import GaussianActor, ReturnNorm, ppo_networks
 
 GAMMA, LAMBDA = 0.9, 0.8
 

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
 
-from nht.recipes.progress import TrainingStatistics
+from nht.recipes.run.statistics import TrainingStatistics
 
 BOUNDS = Bounded(low=torch.tensor([[-1.0, -2.0]] * 3), high=torch.tensor([[1.0, 2.0]] * 3)).space
 

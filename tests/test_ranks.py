@@ -14,7 +14,7 @@ import yaml
 
 import tiny_runs
 import two_ranks
-from nht.recipes.ranks import Ranks
+from nht.recipes.run.ranks import Ranks
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
 

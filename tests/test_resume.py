@@ -14,8 +14,8 @@ from torchrl.checkpoint import Checkpoint
 import fresh_process
 import tiny_runs
 from nht.recipes.config import RunConfig
-from nht.recipes.run_folder import RunFolder
-from nht.recipes.training import TrainingRun
+from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.training import TrainingRun
 
 SETTINGS = ["algo.total_frames=600", "evaluation.every=300"]
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from nht.recipes.scores import (
+from nht.recipes.study.scores import (
     best_of,
     interquartile_mean,
     interval,

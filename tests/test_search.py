@@ -14,10 +14,11 @@ import pandas
 import pytest
 
 from nht.recipes import cluster as cluster_module
-from nht.recipes import search, search_tasks
+from nht.recipes import search
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure
-from nht.recipes.search_tasks import Outcome, Task, claimed, rows_of, run_task
+from nht.recipes.study import jobs as search_tasks
+from nht.recipes.study.jobs import Outcome, Task, claimed, rows_of, run_task
 
 BASE = [
     "evaluation.every=200",
@@ -324,7 +325,7 @@ def test_a_worker_that_dies_is_replaced(tmp_path):
 
 def killed_once(run, folder):
     """Train, and the first time be killed after 1,000 steps."""
-    from nht.recipes.training import TrainingRun
+    from nht.recipes.run.training import TrainingRun
 
     count, deaths = TrainingRun.count_steps, folder / "deaths"
 

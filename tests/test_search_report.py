@@ -8,8 +8,8 @@ import toy_search
 from nht.recipes import report
 from nht.recipes.config import Report
 from nht.recipes.launch import configure
-from nht.recipes.search_report import failures, summary
-from nht.recipes.search_results import SearchResults, final_scores, read_results
+from nht.recipes.study.report import failures, summary
+from nht.recipes.study.results import SearchResults, final_scores, read_results
 
 FIGURES = ("violins", "curves", "profile", "budget", "correlations")
 

@@ -9,7 +9,7 @@ from scipy import stats
 
 from nht.recipes.config import Search
 from nht.recipes.launch import configure
-from nht.recipes.search_space import Distribution, draw, write_manifest
+from nht.recipes.study.space import Distribution, draw, write_manifest
 
 SPACE = {
     "agent": {"algo.gamma": {"uniform": [0.9, 0.99]}, "map.action_scale": {"exponential": [1.0, 10.0]}},

@@ -8,9 +8,9 @@ from tensordict.nn import TensorDictModule
 
 import nht
 from nht.recipes.config import EnvConfig
-from nht.recipes.environments import mapped_env
-from nht.recipes.evaluation import evaluate
-from nht.recipes.video import COLOURS, SHEET_COLUMNS, TILE, Film, contact_sheet, grid, record_video
+from nht.recipes.run.environments import mapped_env
+from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.video import COLOURS, SHEET_COLUMNS, TILE, Film, contact_sheet, grid, record_video
 
 STILL = TensorDictModule(lambda observation: torch.zeros(len(observation), 7), ["observation"], ["action"])
 DOWN = TensorDictModule(  # the second joint presses the tool into the table

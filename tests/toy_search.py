@@ -3,7 +3,7 @@
 import numpy as np
 import pandas
 
-from nht.recipes.search_space import VERSION
+from nht.recipes.study.space import VERSION
 
 STRENGTH = {"raw": 0.1, "nht": 0.9, "laser": 0.5, "svd": 0.7, "scl": 0.8, "jacobian": 0.2}
 

@@ -10,9 +10,9 @@ from torch import nn
 from torchrl.modules import MLP
 
 from nht.recipes import ddpg, ppo
-from nht.recipes.losses import GaussianPPOLoss, JointSoftUpdate, PaperDDPGLoss
-from nht.recipes.networks import GaussianActor, ReturnNorm, RunningNorm
-from nht.recipes.ranks import Ranks
+from nht.recipes.agents.losses import GaussianPPOLoss, JointSoftUpdate, PaperDDPGLoss
+from nht.recipes.agents.networks import GaussianActor, ReturnNorm, RunningNorm
+from nht.recipes.run.ranks import Ranks
 
 OBSERVATION, ACTION, BATCH, UPDATES = 5, 2, 64, 10
 

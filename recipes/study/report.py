@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pandas
 
-from nht.recipes import search_figures
-from nht.recipes.scores import (
+from nht.recipes.study import figures as search_figures
+from nht.recipes.study.results import OURS, SearchResults, read_results
+from nht.recipes.study.scores import (
     Scores,
     interquartile_mean,
     interval,
@@ -18,7 +19,6 @@ from nht.recipes.scores import (
     probability_of_improvement,
     resampled,
 )
-from nht.recipes.search_results import OURS, SearchResults, read_results
 
 Sections = list[tuple[str | None, str | pandas.DataFrame]]
 """Of the page: headings, and what stands below them."""

@@ -16,7 +16,7 @@ from torchrl.envs import TransformedEnv
 from nht.envs import BatchedTask
 from nht.envs.foreign import ForeignTask
 from nht.envs.rendering import ForeignRenderer, SceneRenderer
-from nht.recipes.evaluation import Evaluation, Policy, evaluate
+from nht.recipes.run.evaluation import Evaluation, Policy, evaluate
 
 Picture = NDArray[np.uint8]
 

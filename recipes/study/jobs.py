@@ -19,7 +19,7 @@ import pandas
 from nht.recipes import ddpg, ppo
 from nht.recipes.config import DDPG, PPO
 from nht.recipes.launch import configure
-from nht.recipes.search_space import VERSION, Value
+from nht.recipes.study.space import VERSION, Value
 from nht.storage import replacing
 
 RECIPES: dict[str, Any] = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from nht.recipes.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
-from nht.recipes.search_results import SearchResults
+from nht.recipes.study.results import SearchResults
+from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
 COLOURS = {
     "nht": "#0072B2",

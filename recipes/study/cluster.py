@@ -15,7 +15,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from nht.recipes.search_tasks import Outcome, Task
+from nht.recipes.study.jobs import Outcome, Task
 
 ANSWER = 15.0
 """Seconds within which a cluster must answer."""

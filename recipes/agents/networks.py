@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
 
+from nht.recipes.agents.losses import return_range, reward_range
 from nht.recipes.config import AlgoConfig, DDPGConfig, PPOConfig
-from nht.recipes.losses import return_range, reward_range
 
 Reduction = Callable[[Tensor], Tensor]
 """Adds up a tensor over processes."""

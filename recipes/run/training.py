@@ -20,16 +20,16 @@ from torchrl.collectors import BaseCollector, Collector
 from tqdm import tqdm
 
 import nht
-from nht.recipes.checkpoints import Checkpoints
-from nht.recipes.collecting import CollectorState, batch_copies, make_collector, worker_seed
+from nht.recipes.agents.networks import save_policy
 from nht.recipes.config import Training
-from nht.recipes.environments import mapped_env, run_map, test_env
-from nht.recipes.evaluation import Evaluation
-from nht.recipes.networks import save_policy
-from nht.recipes.progress import Counters, TrainingStatistics
-from nht.recipes.ranks import Ranks
-from nht.recipes.run_folder import RunFolder
-from nht.recipes.video import record_video
+from nht.recipes.run.checkpoints import Checkpoints
+from nht.recipes.run.collecting import CollectorState, batch_copies, make_collector, worker_seed
+from nht.recipes.run.environments import mapped_env, run_map, test_env
+from nht.recipes.run.evaluation import Evaluation
+from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.statistics import Counters, TrainingStatistics
+from nht.recipes.run.video import record_video
 
 VIDEO_EPISODES = 3
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas
 from scipy import stats
 
-from nht.recipes.scores import Scores
+from nht.recipes.study.scores import Scores
 
 COLUMNS = (
     "version",

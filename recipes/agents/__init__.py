@@ -1,0 +1,1 @@
+"""The algorithms: settings, networks and loss of each."""

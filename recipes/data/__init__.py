@@ -1,0 +1,1 @@
+"""Demonstrations: recording them, and reading those of others."""

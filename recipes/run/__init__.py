@@ -1,0 +1,1 @@
+"""What a run of any algorithm has around its loop."""

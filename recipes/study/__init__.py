@@ -1,0 +1,1 @@
+"""Many runs: what is searched, who runs it, what came out."""
