@@ -1,20 +1,27 @@
-"""Tasks on batched MuJoCo, for TorchRL and for Gymnasium."""
+"""Tasks on batched MuJoCo, for TorchRL and for Gymnasium. Nothing is imported before it is asked for."""
 
-from nht.envs.dm_control import make_dm_control
-from nht.envs.experts import Expert
-from nht.envs.foreign import ForeignEnv
-from nht.envs.gymnasium_env import GYMNASIUM_IDS, GymnasiumEnv, register
-from nht.envs.gymnasium_mujoco import make_gymnasium
-from nht.envs.gymnasium_vector import GymnasiumVectorEnv
-from nht.envs.mujoco_batch import BatchedMujocoEnv
-from nht.envs.registry import EXPERTS, FOREIGN, TASKS, make_env, make_expert, make_task
-from nht.envs.task import BatchedTask, Outcome
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from nht.envs.gymnasium_ids import gymnasium_id, register
+from nht.envs.registry import FOREIGN, TASKS, Arm, TaskRecord, make_env, make_expert, make_task
+
+if TYPE_CHECKING:
+    from nht.envs.dm_control import make_dm_control
+    from nht.envs.experts import Expert
+    from nht.envs.foreign import ForeignEnv
+    from nht.envs.gymnasium_env import GymnasiumEnv
+    from nht.envs.gymnasium_mujoco import make_gymnasium
+    from nht.envs.gymnasium_vector import GymnasiumVectorEnv
+    from nht.envs.mujoco_batch import BatchedMujocoEnv
+    from nht.envs.task import BatchedTask, Outcome
 
 __all__ = [
-    "EXPERTS",
     "FOREIGN",
-    "GYMNASIUM_IDS",
     "TASKS",
+    "Arm",
     "BatchedMujocoEnv",
     "BatchedTask",
     "Expert",
@@ -22,11 +29,38 @@ __all__ = [
     "GymnasiumEnv",
     "GymnasiumVectorEnv",
     "Outcome",
+    "TaskRecord",
+    "gymnasium_id",
     "make_dm_control",
     "make_env",
     "make_expert",
     "make_gymnasium",
     "make_task",
 ]
+
+_MODULES = {
+    "BatchedMujocoEnv": "mujoco_batch",
+    "BatchedTask": "task",
+    "Expert": "experts",
+    "ForeignEnv": "foreign",
+    "GymnasiumEnv": "gymnasium_env",
+    "GymnasiumVectorEnv": "gymnasium_vector",
+    "Outcome": "task",
+    "make_dm_control": "dm_control",
+    "make_gymnasium": "gymnasium_mujoco",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 register()

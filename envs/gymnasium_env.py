@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from typing import Any
 
@@ -12,7 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from nht.envs.registry import TASKS, make_task
+from nht.envs.registry import make_task
 from nht.envs.rendering import SceneRenderer
 from nht.envs.task import BatchedTask
 
@@ -25,7 +24,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One copy of a task. ``info`` holds the flags ``success``, ``failure`` and ``diverged``, and the raw keys.
 
     It truncates only if ``options`` has ``max_episode_steps``: ``gymnasium.make`` adds the task's time limit, or its
-    own ``max_episode_steps`` in its place.
+    own ``max_episode_steps`` in its place. None is the task's own limit.
 
     Args:
         task: a key of ``nht.envs.TASKS``.
@@ -43,7 +42,10 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         check_render_mode(render_mode)
         # Gymnasium's rule: without a seed, every environment draws its own.
         options.setdefault("seed", int(self.np_random.integers(2**31)))
-        self.task = make_task(task, num_envs=1, **{"max_episode_steps": sys.maxsize} | options)
+        options = {"max_episode_steps": sys.maxsize} | options
+        if options["max_episode_steps"] is None:
+            del options["max_episode_steps"]
+        self.task = make_task(task, num_envs=1, **options)
         self.metadata = metadata_of(self.task)
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces_of(self.task)
@@ -107,29 +109,3 @@ def spaces_of(task: BatchedTask) -> tuple[Box[np.float32], Box[np.float32]]:
     low, high = (bound.astype(np.float32) for bound in task.actuation_bounds)
     size = task.observation_sizes["observation"]
     return Box(-np.inf, np.inf, (size,), dtype=np.float32), Box(low, high, dtype=np.float32)
-
-
-GYMNASIUM_IDS = {
-    "ant": "nht/Ant-v0",
-    "cheetah_run": "nht/CheetahRun-v0",
-    "half_cheetah": "nht/HalfCheetah-v0",
-    "hopper": "nht/Hopper-v0",
-    "manipulator_bring_ball": "nht/ManipulatorBringBall-v0",
-    "walker2d": "nht/Walker2d-v0",
-    "wam_grasp": "nht/WAMGrasp-v0",
-    "wam_wipe": "nht/WAMWipe-v0",
-}
-"""Gymnasium's id of every task."""
-
-
-def register() -> None:
-    """Make every task known to ``gymnasium.make`` and ``gymnasium.make_vec``, with its time limit."""
-    for task, kind in TASKS.items():
-        if GYMNASIUM_IDS[task] not in gymnasium.registry:
-            gymnasium.register(
-                GYMNASIUM_IDS[task],
-                entry_point="nht.envs.gymnasium_env:GymnasiumEnv",
-                vector_entry_point="nht.envs.gymnasium_vector:GymnasiumVectorEnv",
-                kwargs={"task": task},
-                max_episode_steps=inspect.signature(kind).parameters["max_episode_steps"].default,
-            )

@@ -55,6 +55,8 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
         check_render_mode(render_mode)
         self.autoreset_mode = _as_mode(autoreset_mode)
         options.setdefault("seed", int(self.np_random.integers(2**31)))
+        if options.get("max_episode_steps", 0) is None:  # the task's own
+            del options["max_episode_steps"]
         self.task = make_task(task, num_envs=num_envs, **options)
         self.num_envs = num_envs
         self.metadata = metadata_of(self.task) | {"autoreset_mode": self.autoreset_mode}

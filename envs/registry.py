@@ -1,43 +1,147 @@
-"""The table of tasks by name, and how to make one."""
+"""The table of tasks, and how to make one."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import torch
+from nht.envs.table import Table, imported
 
-from nht.envs.ant import Ant
-from nht.envs.cheetah import CheetahRun
-from nht.envs.dm_control import make_dm_control
-from nht.envs.experts import Expert, GraspExpert, WipeExpert
-from nht.envs.foreign import ForeignEnv
-from nht.envs.gymnasium_mujoco import make_gymnasium
-from nht.envs.locomotion import HalfCheetah, Hopper, Walker2d
-from nht.envs.manipulator import BringBall
-from nht.envs.mujoco_batch import BatchedMujocoEnv
-from nht.envs.task import BatchedTask
-from nht.envs.wam_grasp import WAMGrasp
-from nht.envs.wam_wipe import WAMWipe
+if TYPE_CHECKING:
+    import torch
 
-TASKS: dict[str, type[BatchedTask]] = {
-    "ant": Ant,
-    "cheetah_run": CheetahRun,
-    "half_cheetah": HalfCheetah,
-    "hopper": Hopper,
-    "manipulator_bring_ball": BringBall,
-    "walker2d": Walker2d,
-    "wam_grasp": WAMGrasp,
-    "wam_wipe": WAMWipe,
+    from nht.envs.experts import Expert
+    from nht.envs.mujoco_batch import BatchedMujocoEnv
+    from nht.envs.task import BatchedTask
+
+GOLDEN = Path(__file__).parent / "assets" / "golden"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A serial arm with revolute joints: Denavit-Hartenberg parameters, joint by joint, in the standard convention.
+
+    Attributes:
+        lengths: a [m].
+        twists: alpha [rad].
+        offsets: d [m]; the last one reaches to the tool.
+    """
+
+    lengths: tuple[float, ...]
+    twists: tuple[float, ...]
+    offsets: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class TaskRecord:
+    """What the table knows of a task. Classes may be given by their place, ``"module:Class"``, and are imported late.
+
+    Attributes:
+        task: the ``BatchedTask``.
+        expert: its scripted demonstrator, if it has one.
+        arm: the arm that does it, if it is one whose joint angles are observed as ``"joint_angle"``.
+        context_keys: the observations that an action map sees unless told otherwise.
+        gymnasium_id: None makes one of the name: ``"pour_tea"`` is ``"nht/PourTea-v0"``.
+        max_episode_steps: the task's time limit, for Gymnasium; None leaves it to the task itself.
+        golden: JSON file with the first steps that tests compare with, if there is one.
+    """
+
+    task: type[BatchedTask] | str
+    expert: type[Expert] | str | None = None
+    arm: Arm | str | None = None
+    context_keys: tuple[str, ...] = ("observation",)
+    gymnasium_id: str | None = None
+    max_episode_steps: int | None = None
+    golden: Path | None = None
+
+    @property
+    def task_class(self) -> type[BatchedTask]:
+        """The task's class."""
+        return imported(self.task) if isinstance(self.task, str) else self.task
+
+    @property
+    def expert_class(self) -> type[Expert] | None:
+        """The expert's class."""
+        return imported(self.expert) if isinstance(self.expert, str) else self.expert
+
+    @property
+    def kinematics(self) -> Arm | None:
+        """The arm."""
+        return imported(self.arm) if isinstance(self.arm, str) else self.arm
+
+    @property
+    def options(self) -> list[str]:
+        """The arguments that the task takes."""
+        return list(inspect.signature(self.task_class).parameters)
+
+    @property
+    def endings(self) -> dict[str, bool]:
+        """The options that end an episode at success and at failure, as far as the task knows these."""
+        return {
+            name: True for name in ("terminate_on_success", "terminate_on_failure") if name in self.options
+        }
+
+    @property
+    def has_success(self) -> bool:
+        """Whether the task has a notion of success: whether its episodes can end there."""
+        return "terminate_on_success" in self.endings
+
+
+def _adopt(name: str, found: Any) -> TaskRecord:
+    from nht.envs.task import BatchedTask
+
+    if isinstance(found, TaskRecord):
+        return found
+    if isinstance(found, type) and issubclass(found, BatchedTask):
+        return TaskRecord(found)
+    raise TypeError(f"the task {name!r} must be a TaskRecord or a BatchedTask, got {found!r}.")
+
+
+def _wam(module: str, task: str, expert: str, gymnasium_id: str, golden: str) -> TaskRecord:
+    return TaskRecord(
+        f"nht.envs.{module}:{task}",
+        expert=f"nht.envs.experts:{expert}",
+        arm="nht.envs.wam_kinematics:ARM",
+        context_keys=("tool_position", "joint_angle"),
+        gymnasium_id=gymnasium_id,
+        max_episode_steps=200,
+        golden=GOLDEN / golden,
+    )
+
+
+def _locomotion(task: str, name: str) -> TaskRecord:
+    return TaskRecord(task, max_episode_steps=1_000, golden=GOLDEN / f"{name}.json")
+
+
+TASKS: Table[TaskRecord] = Table(
+    "nht.tasks",
+    {
+        "ant": _locomotion("nht.envs.ant:Ant", "ant"),
+        "cheetah_run": _locomotion("nht.envs.cheetah:CheetahRun", "cheetah_run"),
+        "half_cheetah": _locomotion("nht.envs.locomotion:HalfCheetah", "half_cheetah"),
+        "hopper": _locomotion("nht.envs.locomotion:Hopper", "hopper"),
+        "manipulator_bring_ball": TaskRecord(
+            "nht.envs.manipulator:BringBall",
+            context_keys=("arm_pos", "touch"),
+            max_episode_steps=1_000,
+            golden=GOLDEN / "manipulator_bring_ball.json",
+        ),
+        "walker2d": _locomotion("nht.envs.locomotion:Walker2d", "walker2d"),
+        "wam_grasp": _wam("wam_grasp", "WAMGrasp", "GraspExpert", "nht/WAMGrasp-v0", "wam_grasp.json"),
+        "wam_wipe": _wam("wam_wipe", "WAMWipe", "WipeExpert", "nht/WAMWipe-v0", "wam_wipe.json"),
+    },
+    _adopt,
+)
+"""Every task by the name that recipes and ``make_env`` use; packages add theirs as entry points ``nht.tasks``."""
+
+FOREIGN: Mapping[str, str] = {
+    "dm_control": "nht.envs.dm_control:make_dm_control",
+    "gymnasium": "nht.envs.gymnasium_mujoco:make_gymnasium",
 }
-"""Every task by the name that recipes and ``make_env`` use."""
-
-EXPERTS: dict[str, type[Expert]] = {"wam_grasp": GraspExpert, "wam_wipe": WipeExpert}
-"""The scripted demonstrator of every task that has one."""
-
-FOREIGN: dict[str, Callable[..., ForeignEnv]] = {"dm_control": make_dm_control, "gymnasium": make_gymnasium}
-"""What makes the tasks of other libraries, by the name of the library."""
+"""Where the makers of other libraries' tasks are, by the name of the library."""
 
 
 class UnknownOptionError(ValueError, TypeError):
@@ -47,20 +151,39 @@ class UnknownOptionError(ValueError, TypeError):
     """
 
 
+def find_task(name: str) -> TaskRecord:
+    """The record of a task.
+
+    Args:
+        name: a key of ``TASKS``, or an import path, ``"my_package.tasks:Pour"``.
+
+    Raises:
+        ValueError: for an unknown name; the message lists those that exist.
+    """
+    if name not in TASKS:
+        raise ValueError(
+            f"unknown environment {name!r}: choose from {sorted(TASKS)}, or name an import path, "
+            "package.module:Task."
+        )
+    try:
+        return TASKS[name]
+    except (ImportError, TypeError) as error:
+        raise ValueError(f"the environment {name!r} cannot be found: {error}") from error
+
+
 def make_task(name: str, **options: Any) -> BatchedTask:
     """Build the copies of a task.
 
     Args:
-        name: a key of ``TASKS``.
+        name: a key of ``TASKS``, or an import path, ``"my_package.tasks:Pour"``.
         options: arguments of the task, e.g. ``num_envs=64, seed=0, start="random"``.
 
     Raises:
         ValueError: for an unknown name or option; the message lists those that exist.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown environment {name!r}: choose from {sorted(TASKS)}.")
-    _check_options(TASKS[name], options, name)
-    return TASKS[name](**options)
+    task = find_task(name).task_class
+    _check_options(task, options, name)
+    return task(**options)
 
 
 def make_env(
@@ -74,7 +197,7 @@ def make_env(
     """A batch-native TorchRL environment of ``num_envs`` copies.
 
     Args:
-        name: a key of ``TASKS``, e.g. ``"wam_wipe"``.
+        name: a key of ``TASKS``, e.g. ``"wam_wipe"``, or an import path, ``"my_package.tasks:Pour"``.
         num_envs: number of copies N, the environment's batch size.
         num_threads: native threads that share the copies.
         seed: seed of every random draw of the task.
@@ -84,6 +207,8 @@ def make_env(
     Raises:
         ValueError: for an unknown name or option; the message lists those that exist.
     """
+    from nht.envs.mujoco_batch import BatchedMujocoEnv
+
     task = make_task(name, num_envs=num_envs, num_threads=num_threads, seed=seed, **options)
     return BatchedMujocoEnv(task, device=device)
 
@@ -94,10 +219,12 @@ def make_expert(name: str, **settings: Any) -> Expert:
     Raises:
         ValueError: for a task without one, or an unknown setting.
     """
-    if name not in EXPERTS:
-        raise ValueError(f"{name!r} has no scripted expert: {sorted(EXPERTS)} have one.")
-    _check_options(EXPERTS[name], settings, f"the expert of {name}")
-    return EXPERTS[name](**settings)
+    expert = find_task(name).expert_class if name in TASKS else None
+    if expert is None:
+        having = sorted(task for task in TASKS if TASKS[task].expert is not None)
+        raise ValueError(f"{name!r} has no scripted expert: {having} have one.")
+    _check_options(expert, settings, f"the expert of {name}")
+    return expert(**settings)
 
 
 def _check_options(factory: type, options: dict[str, Any], name: str) -> None:

@@ -6,10 +6,13 @@ in the shoulder, 0.346 m above the base plate. ``assets/wam_arm.xml`` is the sam
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from nht.envs.registry import Arm
 
 Array = NDArray[np.float64]
 
@@ -19,6 +22,8 @@ QUARTER_TURNS = np.array([-1, 1, -1, 1, -1, 1, 0])
 """DH twists alpha in units of pi / 2."""
 D = np.array([0.0, 0.0, 0.55, 0.0, 0.3, 0.0, 0.18])
 """DH link offsets [m]; the last one reaches to the tool face."""
+ARM = Arm(tuple(A.tolist()), tuple((QUARTER_TURNS * math.pi / 2).tolist()), tuple(D.tolist()))
+"""The same, as the table of tasks knows it."""
 
 JOINT_LOW = np.array([-2.6, -2.0, -2.8, -0.9, -1.24, -1.6, -3.0])
 """Lower joint limits [rad], the maker's; the wrist yaw is cut to +-1.24 as in the paper's tasks."""

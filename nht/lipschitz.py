@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nht.align import Aligned
+from nht.alignment import Aligned
 from nht.maps import ActionMap, LinearActionMap
 from nht.networks import ACTIVATION_SLOPES, ContextNetwork
 from nht.residual import Residual

@@ -1,105 +1,32 @@
 """What every task promises, whatever it is about: these tests run over all of ``nht.envs.TASKS``.
 
-A new task adds two entries: its first steps to GOLDEN, and what never changes in its observations to CONSTANT.
+The file that a task's record names as ``golden`` holds its first steps (copy 0 of two, seed 0, after three steps of
+`random_actions`: what the policy sees, and the three rewards) and, as ``constant``, the entries of its observations that
+are the same in every state of every episode, or at least of these short ones.
 """
 
 import inspect
+import json
 import math
 import pickle
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from nht.envs import EXPERTS, GYMNASIUM_IDS, TASKS, make_env, make_expert
+from nht.envs import TASKS, gymnasium_id, make_env, make_expert
 
 FLAGS = ("done", "terminated", "truncated", "success", "failure", "diverged")
 
-# Observation entries that are the same in every state of every episode, or at least of these short ones.
-CONSTANT = {
-    # Six numbers for the contacts of each of 13 bodies: nothing but the feet touches the floor so soon.
-    "ant": {("observation", 27 + 6 * body + i) for body in set(range(13)) - {3, 6, 9, 12} for i in range(6)},
-    "wam_wipe": {("observation", 12), ("goal", 2)},  # the goal's height: it lies on the table
-}
+EXPERTS = [name for name in TASKS if TASKS[name].expert is not None]
 
-# Copy 0 of two, seed 0, after three steps of `random_actions`: what the policy sees, and the three rewards.
-GOLDEN = {
-    "ant": (
-        [
-            *(0.65713, 0.99116, -0.10578, 0.06288, -0.04951),  # height, quaternion
-            *(-0.56469, 0.75069, 0.1322, -1.27669, 0.41216, -1.10266, 0.40664, 1.1449),  # joint angles
-            *(-0.46151, -0.16499, -0.68016, -5.41923, -1.54286, -3.40337),  # torso velocity
-            *(1.45274, 1.19231, -2.52664, -1.52142, 9.96467, -7.93235, 1.4865, 9.55785),  # joint velocities
-            *([0.0] * 36 + [1.0, 1.0, 1.0, 1.0, -1.0, 1.0] + [0.0] * 36),  # contacts: a foot stands
-        ],
-        [-0.7661, -0.60847, -0.76477],
-    ),
-    "cheetah_run": (
-        [
-            *(-0.09512, 0.04012),  # height, pitch
-            *(0.08127, -0.08347, -0.06735, -0.05534, -0.0246, -0.05175),  # joint angles
-            *(0.14477, 0.75625, 0.10797),  # torso velocity
-            *(2.39252, -4.26007, 0.54373, -0.52639, 1.88366, 0.66569),  # joint velocities
-        ],
-        [0.0, 0.0, 0.00029],
-    ),
-    "half_cheetah": (
-        [
-            *(-0.05313, 0.05963),  # height, pitch
-            *(0.1823, -0.24033, 0.26279, -0.03604, -0.01877, 0.07396),  # joint angles
-            *(1.48257, -0.75566, 0.36317),  # torso velocity
-            *(-2.60696, 8.57994, 12.86768, 17.54061, -8.50695, -5.15264),  # joint velocities
-        ],
-        [-0.52163, -0.18481, 0.89852],
-    ),
-    "hopper": (
-        [
-            *(1.2453, -0.00197, 0.00439, -0.00667, -0.01745),  # height, pitch, joint angles
-            *(-0.11047, -0.21808, -0.40762, 0.22424, -1.25707, -0.44562),  # velocities
-        ],
-        [0.97442, 0.97876, 0.94518],
-    ),
-    "manipulator_bring_ball": (
-        [
-            *(0.50924, 0.86062, -0.94058, 0.33958, 0.82853, 0.55995, -0.99921, 0.03968),  # arm: sine, cosine
-            *(-0.01527, 0.99988, -0.30169, 0.9534, -0.02376, 0.99972, -0.03815, 0.99927),  # finger, thumb
-            *(-3.30289, -2.51514, 2.23781, 1.40027, -0.03758, 0.3032, 0.93037, 0.04175),  # their velocities
-            *([0.0] * 5),  # touch
-            *(-0.03008, 0.78571, 0.81252, 0.58293),  # hand
-            *(0.13458, 0.2931, -0.36875, 0.92953, 4.48944, -0.2943, 0.0),  # ball, its velocity
-            *(0.34172, 0.23211, 0.14217, 0.98984),  # target
-        ],
-        [0.0, 0.0, 0.0],
-    ),
-    "walker2d": (
-        [
-            *(1.24252, -0.03694),  # height, pitch
-            *(0.03605, -0.14579, -0.03575, -0.0317, -0.00217, 0.24028),  # joint angles
-            *(-0.44379, -0.64819, -0.45814),  # torso velocity
-            *(5.81792, -10.0, 10.0, 0.3638, -0.87817, 10.0),  # joint velocities
-        ],
-        [0.83121, 0.5631, 0.56484],
-    ),
-    "wam_grasp": (
-        [
-            *(0.0873, 0.56046, 0.02466, 2.22661, 0.10689, 0.14755, 0.11569),  # joint angles
-            *(0.51065, 0.0583, 0.00022),  # tool
-            *(0.47222, -0.02048, -0.08141),  # grasp point
-        ],
-        [-1.0, -1.0, -1.0],
-    ),
-    "wam_wipe": (
-        [
-            *(-0.15767, 0.40263, 0.0544, 2.13132, -0.05915, 0.57357, -0.1523),  # joint angles
-            *(0.46781, -0.05824, 0.08809),  # tool
-            *(0.55478, -0.11511, 0.064),  # goal
-            *(0.03401, -0.01453, -0.99932),  # face normal
-        ],
-        [-1.0, -1.0, -1.0],
-    ),
-}
+
+def golden(name):
+    """What the record's file says."""
+    return json.loads(TASKS[name].golden.read_text())
 
 
 @pytest.fixture(params=sorted(TASKS))
@@ -154,8 +81,10 @@ def test_specs(name, num_envs):
 
 def test_shared_options_and_gymnasium_id(name):
     shared = {"num_envs", "num_threads", "seed", "max_episode_steps"}
-    assert shared <= set(inspect.signature(TASKS[name]).parameters)
-    assert GYMNASIUM_IDS[name].startswith("nht/")
+    parameters = inspect.signature(TASKS[name].task_class).parameters
+    assert shared <= set(parameters)
+    assert TASKS[name].max_episode_steps == parameters["max_episode_steps"].default
+    assert gymnasium_id(name) in gymnasium.registry
 
 
 def test_no_observation_entry_is_constant(name):
@@ -167,7 +96,7 @@ def test_no_observation_entry_is_constant(name):
         for entry in range(size)
         if (data["next", key][:, entry] == data["next", key][0, entry]).all()
     }
-    assert constant == CONSTANT.get(name, set())
+    assert constant == {(key, entry) for key, entries in golden(name)["constant"].items() for entry in entries}
 
 
 def test_flags_agree(name):
@@ -191,7 +120,7 @@ def test_golden_first_steps(name):
     env = make_env(name, num_envs=2)
     env.set_seed(0)
     data = play(env, random_actions(env, 3))["next"]
-    observation, rewards = GOLDEN[name]
+    observation, rewards = golden(name)["observation"], golden(name)["rewards"]
     np.testing.assert_allclose(data["observation"][-1, 0].numpy(), observation, atol=2e-5)
     np.testing.assert_allclose(data["reward"][:, 0, 0].numpy(), rewards, atol=2e-5)
 

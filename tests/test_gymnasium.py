@@ -12,20 +12,20 @@ from torchrl.envs import GymEnv
 from torchrl.envs.utils import check_env_specs
 
 from fresh_process import run
-from nht.envs import GYMNASIUM_IDS, make_env
+from nht.envs import TASKS, gymnasium_id, make_env
 from nht.envs.wam_grasp import HOME, grasp_point, grasp_posture
 from nht.envs.wam_kinematics import tool_pose
 from nht.envs.wam_wipe import GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT
 
 
-@pytest.fixture(params=sorted(GYMNASIUM_IDS))
+@pytest.fixture(params=sorted(TASKS))
 def name(request):
     return request.param
 
 
 @pytest.fixture
 def env(name):
-    env = gymnasium.make(GYMNASIUM_IDS[name])
+    env = gymnasium.make(gymnasium_id(name))
     yield env
     env.close()
 
@@ -63,7 +63,7 @@ def test_spaces(name, env):
 
 
 def test_agrees_with_the_batched_environment(name):
-    single, batched = gymnasium.make(GYMNASIUM_IDS[name], max_episode_steps=None), make_env(name)
+    single, batched = gymnasium.make(gymnasium_id(name), max_episode_steps=None), make_env(name)
     for env in (single.unwrapped, batched):
         env.task.max_episode_steps = 20  # short enough for those who fall
     single.action_space.seed(0)
@@ -105,11 +105,11 @@ def test_a_seed_repeats_and_no_seed_does_not(env):
 
 
 def test_options_reach_the_task(name):
-    env = gymnasium.make(GYMNASIUM_IDS[name], seed=3)
-    seeded = gymnasium.make(GYMNASIUM_IDS[name], seed=3)
+    env = gymnasium.make(gymnasium_id(name), seed=3)
+    seeded = gymnasium.make(gymnasium_id(name), seed=3)
     np.testing.assert_array_equal(env.reset()[0], seeded.reset()[0])
     with pytest.raises(TypeError, match="unexpected keyword argument 'nonesuch'"):
-        gymnasium.make(GYMNASIUM_IDS[name], nonesuch=1)
+        gymnasium.make(gymnasium_id(name), nonesuch=1)
 
 
 def test_videos_run_at_real_time(env):
@@ -118,13 +118,13 @@ def test_videos_run_at_real_time(env):
 
 
 def test_works_through_torchrls_wrapper(name):
-    check_env_specs(GymEnv(GYMNASIUM_IDS[name]))
+    check_env_specs(GymEnv(gymnasium_id(name)))
 
 
 @pytest.mark.filterwarnings("ignore:.*not in the possible render_modes:UserWarning")
 def test_unknown_render_mode(name):
     with pytest.raises(ValueError, match=r"None or one of \['rgb_array'\], got 'ansi'"):
-        gymnasium.make(GYMNASIUM_IDS[name], render_mode="ansi")
+        gymnasium.make(gymnasium_id(name), render_mode="ansi")
 
 
 def test_without_a_render_mode_there_is_no_picture(env):
@@ -145,7 +145,7 @@ def test_closing_twice(env):
 
 @pytest.mark.usefixtures("can_render")
 def test_pictures_show_what_moves(name):
-    env = gymnasium.make(GYMNASIUM_IDS[name], render_mode="rgb_array")
+    env = gymnasium.make(gymnasium_id(name), render_mode="rgb_array")
     env.reset(seed=0)
     before = env.render()
     kept = before.copy()

@@ -10,13 +10,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 
-from nht.envs import GYMNASIUM_IDS, GymnasiumEnv, GymnasiumVectorEnv, make_env
+from nht.envs import TASKS, GymnasiumEnv, GymnasiumVectorEnv, gymnasium_id, make_env
 
 COPIES = 3
 WIPE = "nht/WAMWipe-v0"
 
 
-@pytest.fixture(params=sorted(GYMNASIUM_IDS))
+@pytest.fixture(params=sorted(TASKS))
 def name(request):
     return request.param
 
@@ -33,9 +33,9 @@ def play(env, count, seed=0):
 
 @pytest.mark.filterwarnings("error")
 def test_make_vec(name):
-    env = gymnasium.make_vec(GYMNASIUM_IDS[name], num_envs=COPIES)
+    env = gymnasium.make_vec(gymnasium_id(name), num_envs=COPIES)
     assert type(env) is GymnasiumVectorEnv
-    single = gymnasium.make(GYMNASIUM_IDS[name])
+    single = gymnasium.make(gymnasium_id(name))
     assert env.single_observation_space == single.observation_space
     assert env.single_action_space == single.action_space
     assert env.metadata == single.metadata | {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -97,7 +97,7 @@ def assert_same_infos(ours, theirs):
 def test_equals_gymnasiums_sync_vector_env(name, mode):
     limit = 12
     ours = gymnasium.make_vec(
-        GYMNASIUM_IDS[name], COPIES, max_episode_steps=limit, autoreset_mode=mode.value
+        gymnasium_id(name), COPIES, max_episode_steps=limit, autoreset_mode=mode.value
     ).unwrapped
     singles = [partial(follower, name, limit, ours.task, row) for row in range(COPIES)]
     theirs = SyncVectorEnv(singles, autoreset_mode=mode)
@@ -131,7 +131,7 @@ def test_equals_the_batched_environment(name):
     limits = {"max_episode_steps": 20, "seed": 7}
     batched = make_env(name, num_envs=COPIES, **limits)
     vector = gymnasium.make_vec(
-        GYMNASIUM_IDS[name], num_envs=COPIES, autoreset_mode=AutoresetMode.SAME_STEP, **limits
+        gymnasium_id(name), num_envs=COPIES, autoreset_mode=AutoresetMode.SAME_STEP, **limits
     )
     tensordict = batched.reset()
     observations, infos = vector.reset()
