@@ -21,7 +21,7 @@ from nht.recipes.agents.table import find_algorithm, name_of
 from nht.recipes.maps.interface import run_map
 from nht.recipes.maps.kinds import default_scale, map_context_keys
 from nht.recipes.run.dashboard import Dashboard, open_dashboard
-from nht.recipes.run.environments import check_env
+from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
 from nht.recipes.run.ownership import claimed, owner_of
 from nht.recipes.run.ranks import Ranks
@@ -102,7 +102,9 @@ class RunFolder:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
         if not (kept := self.path / MAP_FILE).exists():
-            nht.save_map(run_map(self.config, motors), kept)
+            map = run_map(self.config, motors)
+            mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
+            nht.save_map(map, kept)
         self._dashboard = open_dashboard(self.path, self.config)
 
     def _look(self) -> None:
