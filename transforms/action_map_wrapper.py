@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -72,10 +71,10 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
                 "ActionMapVectorWrapper is for vector environments."
             )
         taken = take_map(map, action_scale, saturation)
-        self._map_has_a_file = isinstance(map, str | os.PathLike)
+        self._map_has_a_file = isinstance(map, str | Path)
         RecordConstructorArgs.__init__(
             self,
-            map=os.fspath(map) if isinstance(map, str | os.PathLike) else map,
+            map=str(map) if isinstance(map, Path) else map,
             context_keys=_as_json(context_keys),
             action_scale=None if action_scale is None else float(action_scale),
             saturation=saturation,
@@ -133,6 +132,9 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
 
     Arguments, and errors beside those of ``ActionMapWrapper``, are the same.
 
+    Attributes:
+        autoreset_mode: that of the wrapped vector, for those who look for it there, such as TorchRL's ``GymWrapper``.
+
     Raises:
         KeyError: also if a copy's mask in ``infos`` says that it has no such context entry.
     """
@@ -153,8 +155,8 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
         )
         self.action_space = self._mapping.action_space
         self.single_action_space = self._mapping.single_action_space
-        mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
-        self._skips_a_step = mode is AutoresetMode.NEXT_STEP
+        self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self._skips_a_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         self._waiting = np.zeros(env.num_envs, dtype=bool)  # copies that the next step resets
         self._context: Floats | None = None
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 from collections.abc import Sequence
+from pathlib import Path
 
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch import Tensor
 from nht import ActionMap, load_map
 from nht.saturation import Saturation
 
-MapOrFile = ActionMap | str | os.PathLike[str]
+MapOrFile = ActionMap | str | Path
 
 
 def take_map(
@@ -30,7 +30,7 @@ def take_map(
         FileNotFoundError: if there is no such file.
         ValueError: if the action scale, given or the map's own, is not positive and finite; on another saturation.
     """
-    if isinstance(map, str | os.PathLike):
+    if isinstance(map, str | Path):
         taken = load_map(map)
     elif isinstance(map, ActionMap):
         taken = copy.deepcopy(map)
@@ -71,3 +71,16 @@ def resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> l
     if bool(keys) != bool(map.context_dim):
         raise ValueError(f"the map's context has {map.context_dim} entries, got context_keys {keys}.")
     return keys
+
+
+def check_distinct(action_keys: set[NestedKey], context_key: NestedKey, executed_key: NestedKey) -> None:
+    """No two entries have one key, but that the policy's action may stand where the actuation does.
+
+    Raises:
+        ValueError: if two have.
+    """
+    if context_key == executed_key or {context_key, executed_key} & action_keys:
+        raise ValueError(
+            f"context_key {context_key!r} and executed_key {executed_key!r} must differ from each other and "
+            f"from the action's keys, {', '.join(sorted(map(repr, action_keys)))}."
+        )

@@ -1,4 +1,4 @@
-"""The raw context in TorchRL's data, and which transforms between environment and map leave it as it is."""
+"""The raw context in TorchRL's data, and what must hold of it."""
 
 from __future__ import annotations
 
@@ -8,36 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs.transforms import (
-    ActionScaling,
-    FrameSkipTransform,
-    InitTracker,
-    MultiAction,
-    NoopResetEnv,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    StepCounter,
-    TrajCounter,
-    Transform,
-    VecGymEnvTransform,
-)
-
-STEPPING_AGAIN = (FrameSkipTransform, NoopResetEnv, MultiAction)
-"""Transforms that step the environment on their own; of what was read from its first answer nothing is left then."""
-
-LEAVING_OBSERVATIONS = (
-    *STEPPING_AGAIN,
-    ActionScaling,
-    InitTracker,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    StepCounter,
-    TrajCounter,
-    VecGymEnvTransform,  # a part of TorchRL's vectorised Gym environments: raw is what it leaves
-)
-"""Transforms that rewrite nothing that the environment observed. Of any other, a user's own say, we do not know."""
+from torchrl.envs.transforms import Transform
 
 
 def read_context(tensordict: TensorDictBase, keys: Sequence[NestedKey], dtype: torch.dtype) -> Tensor:
@@ -48,25 +19,6 @@ def read_context(tensordict: TensorDictBase, keys: Sequence[NestedKey], dtype: t
     return torch.cat([tensordict[key] for key in keys], -1).to(dtype)
 
 
-def rewriters(ahead: Sequence[Transform], spared: tuple[type[Transform], ...]) -> list[Transform]:
-    """Of the transforms ahead, those that may rewrite observations.
-
-    Raises:
-        ValueError: if a transform that steps the environment again runs behind one of them: what the environment
-            observed in this step is out of reach then.
-    """
-    found: list[Transform] = []
-    for transform in ahead:
-        if found and isinstance(transform, STEPPING_AGAIN):
-            raise ValueError(
-                f"{type(transform).__name__} steps the environment again behind {type(found[0]).__name__}, which may "
-                f"rewrite the context: put {type(transform).__name__} or the ActionMapTransform in front of it."
-            )
-        if type(transform) not in spared:
-            found.append(transform)
-    return found
-
-
 def check_context(
     observation_spec: Composite, keys: Sequence[NestedKey], lead: torch.Size, context_dim: int
 ) -> None:
@@ -75,8 +27,13 @@ def check_context(
     Raises:
         KeyError: if one is not there.
         TypeError: if one is not of floats.
-        ValueError: on another shape or width.
+        ValueError: on another shape or width, or if the actuation is a sequence, as MultiAction makes it.
     """
+    if -1 in lead:
+        raise ValueError(
+            "the environment takes several actuations at once, but there is one context for all of them: "
+            "put MultiAction behind the ActionMapTransform."
+        )
     available = list(observation_spec.keys(True, True))
     for key in keys:
         if key not in available:

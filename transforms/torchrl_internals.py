@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose, Transform, VecGymEnvTransform
 
 
 class EarlyReader(Transform):
@@ -69,35 +69,68 @@ def leaves(transform: Transform) -> list[Transform]:
     return [leaf for child in transform.transforms for leaf in leaves(child)]
 
 
-def let_read_early(chain: Compose, spared: tuple[type[Transform], ...]) -> None:
-    """Has a chain call its early readers before any transform runs that may rewrite the observation.
+def let_read_early(chain: Compose, also: Sequence[EarlyReader] = ()) -> None:
+    """Has a chain call its early readers with what the environment returned, before it runs any transform.
 
-    The order, the indices and the names of the chain's transforms stay as they are, and so does what they do.
+    The order, the indices and the names of the chain's transforms stay as they are, and so does what they do. What a
+    transform takes for its ``parent``, and steps again, reads as early.
 
-    Relies on ``TransformedEnv`` calling ``_step`` and ``_reset`` of its transform, with these two arguments, and on
-    objects being allowed to have methods of their own in their ``__dict__``, where ``clone`` of a Compose leaves them.
+    Relies on ``TransformedEnv`` calling ``_step`` and ``_reset`` of its transform with these arguments, on ``parent``
+    calling ``_rebuild_up_to`` of the chain, and on an object's ``__dict__`` going before its class, which ``clone`` of
+    a Compose leaves behind.
 
     Args:
         chain: the outermost Compose.
-        spared: types of transforms that do not rewrite observations; of subclasses nobody knows.
+        also: early readers outside the chain.
     """
-    for method in ("_step", "_reset"):
-        chain.__dict__[method] = _ReadingEarly(chain, method, spared)
+    reading = getattr(chain.__dict__.get("_step"), "__self__", None)
+    if not isinstance(reading, _EarlyReading):
+        reading = _EarlyReading(chain)
+        chain.__dict__.update(_step=reading.step, _reset=reading.reset, _rebuild_up_to=reading.rebuild_up_to)
+    reading.also += also
 
 
-class _ReadingEarly:
-    """``Compose._step`` or ``_reset`` of one chain, with its early readers; it can be copied and pickled with it."""
+class _EarlyReading:
+    """What one chain does instead of ``Compose._step``, ``_reset`` and ``_rebuild_up_to``.
 
-    def __init__(self, chain: Compose, method: str, spared: tuple[type[Transform], ...]) -> None:
-        self.chain, self.method, self.spared = chain, method, spared
+    It is no function within another, so that it is copied and pickled with its chain.
+    """
 
-    def __call__(self, tensordict: TensorDictBase, observed: TensorDictBase) -> TensorDictBase:
+    def __init__(self, chain: Compose) -> None:
+        self.chain = chain
+        self.also: list[EarlyReader] = []
+
+    def step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._run("_step", tensordict, next_tensordict)
+
+    def reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._run("_reset", tensordict, tensordict_reset)
+
+    def _run(self, method: str, tensordict: TensorDictBase, observed: TensorDictBase) -> TensorDictBase:
         chain = leaves(self.chain)
-        waiting = [leaf for leaf in chain if isinstance(leaf, EarlyReader) and leaf.reads_early]
+        waiting = [*self.also, *_early(chain)]
         for leaf in chain:
-            if waiting and type(leaf) not in self.spared:
-                for reader in waiting:
-                    reader.read_raw(observed)
-                waiting = []
-            observed = getattr(leaf, self.method)(tensordict, observed)
+            if not completes_the_environment(leaf):
+                while waiting:
+                    waiting.pop().read_raw(observed)
+            observed = getattr(leaf, method)(tensordict, observed)
+        for reader in waiting:
+            reader.read_raw(observed)
         return observed
+
+    def rebuild_up_to(self, final_transform: Transform) -> tuple[TransformedEnv | None, Compose | None]:
+        env, chain = Compose._rebuild_up_to(self.chain, final_transform)
+        if env is not None:
+            inside = leaves(env.transform)
+            behind = leaves(self.chain)[len(inside) :]
+            let_read_early(env.transform, [*self.also, *_early(behind)])
+        return env, chain
+
+
+def completes_the_environment(transform: Transform) -> bool:
+    """Whether a transform is a part of TorchRL's own environments: of vectorised Gym ones, raw is what it leaves."""
+    return isinstance(transform, VecGymEnvTransform)
+
+
+def _early(transforms: Sequence[Transform]) -> list[EarlyReader]:
+    return [found for found in transforms if isinstance(found, EarlyReader) and found.reads_early]
