@@ -1,150 +1,19 @@
-"""Action maps: from a low-dimensional action and a context to the actuation of the motors, and back."""
+"""The family's core: NHT, SVD and the raw interface."""
 
-import inspect
-from abc import ABC, abstractmethod
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from torch import Tensor, nn
+from tensordict import TensorDictBase
+from torch import Tensor
 
-from nht.geometry import (
-    householder_apply,
-    householder_coordinates,
-    householder_frame,
-    least_squares,
-    sphere_exp,
-)
-from nht.networks import Activation, ContextNetwork, check_choice
+from nht.action_map import ActionMap
+from nht.geometry import householder_apply, householder_coordinates, householder_frame, sphere_exp
+from nht.linear_map import LinearActionMap, NormKind
+from nht.networks import Activation, ContextNetwork
 
-NormKind = Literal["spectral", "frobenius"]
-
-
-class ActionMap(nn.Module, ABC):
-    """A fixed or learned map (action, context) -> actuation.
-
-    Shapes: action (*batch, k), actuation (*batch, n), context (*batch, context_dim). A map that needs no
-    context takes one all the same; its last dimension may then be 0. A subclass that keeps its constructor's
-    arguments as attributes of the same names is trained, saved and loaded like those below.
-
-    Attributes:
-        action_dim: k.
-        actuation_dim: n.
-        context_dim: width of the context.
-        context_keys: the entries that, side by side in this order, are the context. None until trained.
-        data_fingerprint: which demonstrations it was trained on. None until trained.
-        action_scale: buffer, scalar: the largest |a_i| of the projected demonstrations. 1 until trained.
-        actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
-        actuation_high: buffer, (n,): the largest ones. infinity until trained.
-        learns: whether demonstrations decide what the map does, not only its bounds.
-        needs_next_context: whether `loss` reads ("next", "context"), (batch, context_dim).
-    """
-
-    learns = True
-    needs_next_context = False
-
-    action_scale: Tensor
-    actuation_low: Tensor
-    actuation_high: Tensor
-
-    def __init__(self, context_dim: int, actuation_dim: int, action_dim: int) -> None:
-        super().__init__()
-        if not 1 <= action_dim <= actuation_dim:
-            raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}")
-        if context_dim < 0:
-            raise ValueError(f"context_dim must be 0 or more, got {context_dim}")
-        self.context_dim = context_dim
-        self.actuation_dim = actuation_dim
-        self.action_dim = action_dim
-        self.context_keys: tuple[NestedKey, ...] | None = None
-        self.data_fingerprint: str | None = None
-        self.register_buffer("action_scale", torch.ones(()))
-        self.register_buffer("actuation_low", torch.full((actuation_dim,), -torch.inf))
-        self.register_buffer("actuation_high", torch.full((actuation_dim,), torch.inf))
-
-    @abstractmethod
-    def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Actuation, (*batch, n). Nothing is scaled or clipped here."""
-
-    @abstractmethod
-    def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """The action, (*batch, k), that stands for an actuation."""
-
-    def loss(self, batch: TensorDictBase) -> Tensor:
-        """What training minimises: the mean of |u - u_hat|^2, u_hat being u projected and mapped back.
-
-        Args:
-            batch: "context" (batch, context_dim) and "actuation" (batch, n); and ("next", "context") for a map
-                that needs it.
-        """
-        actuation, context = batch["actuation"], batch["context"]
-        return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
-
-    def fit(self, batch: TensorDictBase) -> bool:
-        """Prepares the map from all training data, before any gradient step.
-
-        Returns:
-            True if that was all the training it takes: a closed form.
-        """
-        return False
-
-    def init_args(self) -> dict[str, Any]:
-        """The constructor's arguments, JSON values or other maps: they make an untrained twin."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
-
-    @torch.no_grad()
-    def take_over(self, map: "ActionMap") -> None:
-        """What another map learned about its demonstrations, and its precision and device: for maps that wrap it."""
-        self.context_keys = map.context_keys
-        self.data_fingerprint = map.data_fingerprint
-        self.to(map.action_scale)
-        self.action_scale.copy_(map.action_scale)
-        self.actuation_low.copy_(map.actuation_low)
-        self.actuation_high.copy_(map.actuation_high)
-
-
-class LinearActionMap(ActionMap):
-    """An action map that is linear in the action: u = Q(c) a.
-
-    Attributes:
-        network: what turns the context into a description of the basis; None if the basis is always the same.
-        network_gain: a Lipschitz constant, in the spectral norm, from the network's output to the basis; without
-            a network, from the context to the basis.
-        lipschitz: the Lipschitz constant of Q(c) that training keeps to; None for no limit.
-        lipschitz_norm: the norm of the layers' matrices that is limited to this end.
-    """
-
-    network: ContextNetwork | None
-
-    def __init__(
-        self,
-        context_dim: int,
-        actuation_dim: int,
-        action_dim: int,
-        lipschitz: float | None = None,
-        lipschitz_norm: NormKind = "spectral",
-    ) -> None:
-        super().__init__(context_dim, actuation_dim, action_dim)
-        if lipschitz is not None and not 0 < lipschitz < torch.inf:
-            raise ValueError(f"lipschitz must be a positive number or None, got {lipschitz}")
-        check_choice("lipschitz_norm", lipschitz_norm, get_args(NormKind))
-        self.network = None
-        self.network_gain = 0.0
-        self.lipschitz = lipschitz
-        self.lipschitz_norm = lipschitz_norm
-
-    @abstractmethod
-    def basis(self, context: Tensor) -> Tensor:
-        """Q(c): (*batch, context_dim) -> (*batch, n, k)."""
-
-    def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Q(c) a."""
-        return (self.basis(context) @ action.unsqueeze(-1)).squeeze(-1)
-
-    def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """Least squares: the action whose actuation is nearest (Eq. 5)."""
-        return least_squares(self.basis(context), actuation)
+__all__ = ["NHT", "SVD", "ActionMap", "Identity", "LinearActionMap", "NormKind"]
 
 
 class NHT(LinearActionMap):

@@ -55,15 +55,21 @@ LAYERS = {
     "nht.geometry": 0,
     "nht.networks": 0,
     "nht.episodes": 0,
+    "nht.saturation": 0,
+    "nht.arguments": 0,
+    "nht.torch_internals": 0,
     "nht.demos": 1,
-    "nht.maps": 1,
-    "nht.lipschitz": 3,
-    "nht.storage": 4,
-    "nht.train": 4,
-    "nht.export": 5,
-    "nht": 6,
+    "nht.action_map": 1,
+    "nht.offset": 1,
+    "nht.linear_map": 2,
+    "nht.maps": 3,
+    "nht.lipschitz": 5,
+    "nht.storage": 6,
+    "nht.train": 7,
+    "nht.export": 7,
+    "nht": 8,
 }
-FAMILY_LAYER = 2
+FAMILY_LAYER = 4
 
 
 def test_imports_point_one_way():

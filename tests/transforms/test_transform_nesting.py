@@ -27,7 +27,7 @@ from torchrl.envs import (
 )
 
 from nht import NHT, Identity
-from nht.transforms import ActionMapTransform, ContextSnapshot
+from nht.transforms import ActionMapTransform
 from toy_envs import CONTEXT_KEYS, LIMIT, SCALE, ToyArm, assert_mapped, mapped_arm, toy_map, toy_transform
 
 pytestmark = [
