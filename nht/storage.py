@@ -82,6 +82,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
     map.context_keys = (
         None if keys is None else tuple(key if isinstance(key, str) else tuple(key) for key in keys)
     )
+    map.saturation = description.get("saturation", "clip")
     _fill(map, tensors, path)
     return map.to(device).eval().requires_grad_(False)
 
@@ -97,6 +98,7 @@ def describe(map: ActionMap) -> dict[str, Any]:
         "actuation_dim": map.actuation_dim,
         "action_dim": map.action_dim,
         "action_scale": float(map.action_scale),
+        "saturation": map.saturation,
         "actuation_low": [_finite(value) for value in map.actuation_low.tolist()],
         "actuation_high": [_finite(value) for value in map.actuation_high.tolist()],
         "lipschitz_certificate": _finite(certificate(map)),
