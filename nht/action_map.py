@@ -59,7 +59,11 @@ class ActionMap(nn.Module, ABC):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         """Lets every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
         super().__init_subclass__(**kwargs)
-        for name, wrap in (("__init__", _recording), ("forward", _checked_forward), ("project", _checked_project)):
+        for name, wrap in (
+            ("__init__", _recording),
+            ("forward", _checked_forward),
+            ("project", _checked_project),
+        ):
             method = getattr(cls, name)
             if not getattr(method, "__isabstractmethod__", False) and not hasattr(method, WRAPPED):
                 setattr(cls, name, wrap(method))
@@ -79,6 +83,15 @@ class ActionMap(nn.Module, ABC):
         self.register_buffer("action_scale", torch.ones(()))
         self.register_buffer("actuation_low", torch.full((self.actuation_dim,), -torch.inf))
         self.register_buffer("actuation_high", torch.full((self.actuation_dim,), torch.inf))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Lets a subclass have a layer called like one of the methods below, as many autoencoders do.
+
+        `forward` and `project` of the subclass then find the layer, and the method is ``type(map).encode(map, ...)``.
+        """
+        super().__setattr__(name, value)
+        if name in ("decode", "encode", "rest") and isinstance(value, nn.Module | nn.Parameter):
+            self.__dict__[name] = value
 
     @property
     def saturation(self) -> Saturation:

@@ -80,7 +80,9 @@ def plain(value: Any) -> Any:
         return [plain(one) for one in value]
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: plain(one) for key, one in value.items()}
-    raise TypeError(f"{type(value).__name__} is neither number, text, None, map, nor a list or dict of these.")
+    raise TypeError(
+        f"{type(value).__name__} is neither number, text, None, map, nor a list or dict of these."
+    )
 
 
 def _is_map(value: Any) -> bool:

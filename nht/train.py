@@ -13,6 +13,7 @@ from torch import Tensor
 from nht.demos import Demos
 from nht.lipschitz import LipschitzProjection, certificate
 from nht.maps import ActionMap, LinearActionMap
+from nht.storage import check_storable
 
 EVALUATE_EVERY = 250  # gradient steps
 RANK_TOLERANCE = 1e-5  # actuations' singular values below this share of the largest one are rounding
@@ -71,6 +72,7 @@ def train_map(
             two episodes; on a number out of range. FloatingPointError: if the loss diverged from the start.
     """
     _check_numbers(batch_size, learning_rate, max_steps, patience, validation_share)
+    check_storable(map)
     start = time.perf_counter()
     keys = _context_keys(demos, map, context_keys)
     data = _training_data(demos, map, keys)
