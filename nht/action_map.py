@@ -13,7 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from nht.arguments import constructor_arguments, recorded
+from nht.arguments import named_arguments, positional_arguments, recorded
 from nht.networks import check_choice
 from nht.saturation import DEFAULT_SATURATION, Saturation, saturate
 
@@ -205,11 +205,11 @@ class ActionMap(nn.Module, ABC):
         numbers, text, None, lists and dictionaries of these, and other maps can stand in a file. What a constructor
         takes by position alone, `init_positional` gives.
         """
-        return constructor_arguments(self, self._recorded_arguments)[1]
+        return named_arguments(self, self._recorded_arguments)
 
     def init_positional(self) -> tuple[Any, ...]:
         """The arguments that can be given by position alone; () for a constructor without ``*args`` and ``/``."""
-        return constructor_arguments(self, self._recorded_arguments)[0]
+        return positional_arguments(self, self._recorded_arguments)
 
     @torch.no_grad()
     def take_over(self, map: ActionMap) -> None:

@@ -30,6 +30,7 @@ __all__ = ["check_storable", "describe", "load_map", "replacing", "save_map"]
 FORMAT = "nht.action_map"
 FORMAT_VERSION = 2
 BOUNDS = ("actuation_low", "actuation_high")  # buffers that may be infinite
+FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.eye, torch.rand, torch.randn)
 LONGEST_REASON = 600  # characters of what an error says about a file
 
 
@@ -203,7 +204,7 @@ class _Allowance(TorchFunctionMode):
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
-        if func in (torch.empty, torch.zeros, torch.ones, torch.full, torch.eye, torch.rand, torch.randn):
+        if func in FACTORIES:
             sized = {
                 key: value for key, value in kwargs.items() if key not in ("generator", "out", "pin_memory")
             }

@@ -190,7 +190,10 @@ def test_safetensors_files_of_others_are_refused(path: Path) -> None:
         ({"header": {"format_version": "3"}}, "format version 3, this version of nht reads 1 and 2"),
         ({"header": {"map": "{"}}, "its description is damaged"),
         ({"header": {"map": "{}"}}, "its description is damaged: KeyError: 'module'"),
-        ({"description": {"class": "Unheard"}}, "unknown class 'Unheard'; those of nht are .*Identity.*NHT.*SVD"),
+        (
+            {"description": {"class": "Unheard"}},
+            "unknown class 'Unheard'; those of nht are .*Identity.*NHT.*SVD",
+        ),
         (
             {
                 "description": {

@@ -65,6 +65,7 @@ LAYERS = {
     "nht.maps": 3,
     "nht.lipschitz": 5,
     "nht.replacing": 0,
+    "nht.actuation_lipschitz": 6,
     "nht.map_classes": 5,
     "nht.description": 6,
     "nht.storage": 7,
