@@ -129,7 +129,7 @@ def test_equals_gymnasiums_sync_vector_env(name, mode):
 
 def test_equals_the_batched_environment(name):
     limits = {"max_episode_steps": 20, "seed": 7}
-    batched = make_env(name, num_envs=COPIES, **limits)
+    batched = make_env(name, num_envs=COPIES, seed=0, **limits)
     vector = gymnasium.make_vec(
         gymnasium_id(name), num_envs=COPIES, autoreset_mode=AutoresetMode.SAME_STEP, **limits
     )

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data.postprocs import MultiStep
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import ClipPPOLoss, DDPGLoss, SoftUpdate
 from torchrl.objectives.value import GAE
 
@@ -96,12 +96,9 @@ class JointSoftUpdate(SoftUpdate):
 
 
 def reward_range(env: EnvBase) -> Range:
-    """Smallest and largest reward of a step, as the environment's spec has it; infinite where it knows none."""
-    space = env.reward_spec.space
-    # TorchRL writes "unbounded" as the largest numbers of the type.
-    low, high = float(space.low.min()), float(space.high.max())
-    largest = torch.finfo(env.reward_spec.dtype).max
-    return (low if low > -largest else -math.inf), (high if high < largest else math.inf)
+    """Smallest and largest reward of a step, as the simulation behind ``env`` knows it; infinite where unknown."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    return getattr(getattr(base, "task", None), "reward_range", (-math.inf, math.inf))
 
 
 def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> Range:
