@@ -15,7 +15,7 @@ from torchrl.envs.utils import check_env_specs
 import nht
 from nht.envs import foreign, make_dm_control
 from nht.recipes import ddpg, evaluate
-from nht.recipes.agents.losses import reward_range
+from nht.recipes.agents.returns import reward_range
 from nht.recipes.config import DDPG, EnvConfig, Evaluate
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import base_env, mapped_env

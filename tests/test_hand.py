@@ -11,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 
 import nht
 from nht.envs import make_gymnasium
-from nht.recipes.agents.losses import reward_range
+from nht.recipes.agents.returns import reward_range
 from nht.recipes.config import DDPG, EnvConfig
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import mapped_env, raw_actuation
