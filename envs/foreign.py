@@ -49,7 +49,9 @@ class ForeignCopy(ABC):
     time_per_step: float
     """Simulated time of one environment step [s]."""
     max_episode_steps: float = math.inf
-    """Environment steps in an episode, or infinity."""
+    """Environment steps in an episode, or infinity: where the environment knows no limit, it gets one."""
+    longest_episode: int | None = None
+    """That limit; None is ``LONGEST_EPISODE``."""
     reward_range: tuple[float, float] = (-math.inf, math.inf)
     """Smallest and largest reward of a step."""
     aside: Sequence[str] = ()
@@ -84,7 +86,7 @@ class ForeignTask:
         self.time_per_step = copies[0].time_per_step
         self.reward_range = copies[0].reward_range
         limit = copies[0].max_episode_steps
-        self.max_episode_steps = LONGEST_EPISODE if math.isinf(limit) else round(limit)
+        self.max_episode_steps = _longest(copies[0]) if math.isinf(limit) else round(limit)
 
     @property
     def can_resume(self) -> bool:
@@ -123,7 +125,8 @@ class ForeignEnv(SerialEnv):
 
     Every observation is flat and in float32; ``"observation"`` is all of them side by side, in the order of the
     environment. ``"success"`` is what the environment says of itself, if it does; ``"failure"`` and ``"diverged"``
-    are never set, unless the environment is one of ours. Actions are taken in float32, whatever the environment's own precision.
+    are never set, unless the environment is one of ours. Actions come in float32, whatever precision the environment
+    takes them in.
 
     Partial steps touch only the copies that ``"_step"`` names: the others show what they showed, with the reward 0.
 
@@ -159,7 +162,7 @@ class ForeignEnv(SerialEnv):
         sizes = {
             key: spec.shape[-1] for key, spec in self.observation_spec.items() if spec.dtype == torch.float32
         }
-        self.task = ForeignTask([simulator(env.base_env) for env in members(self)], sizes)
+        self.task = ForeignTask([env.copy_of for env in members(self)], sizes)
         self._recipe = (make, simulator, num_envs, name)
         self._shown: TensorDictBase | None = None
         self._pictures = Pictures(self.task)
@@ -232,9 +235,7 @@ def _restored(
     return env
 
 
-def _flat(
-    make: Callable[[], EnvBase], simulator: Callable[[EnvBase], ForeignCopy], name: str
-) -> TransformedEnv:
+def _flat(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], ForeignCopy], name: str) -> FlatEnv:
     env = make()
     check_specs(env, name)
     copy = simulator(env)
@@ -252,8 +253,21 @@ def _flat(
     if keys != ["observation"]:
         transforms.append(CatTensors(keys, "observation", del_keys=False, sort=False))
     if math.isinf(copy.max_episode_steps):
-        transforms.append(StepCounter(LONGEST_EPISODE))
-    return TransformedEnv(env, Compose(*transforms, OutcomeFlags()))
+        transforms.append(StepCounter(_longest(copy)))
+    flat = FlatEnv(env, Compose(*transforms, OutcomeFlags()))
+    flat.copy_of = copy
+    return flat
+
+
+def _longest(copy: ForeignCopy) -> int:
+    return LONGEST_EPISODE if copy.longest_episode is None else copy.longest_episode
+
+
+class FlatEnv(TransformedEnv):
+    """One copy as ``ForeignEnv`` steps it."""
+
+    copy_of: ForeignCopy
+    """Its simulator."""
 
 
 def _as_vector(key: str, dimensions: int) -> Transform:
@@ -279,7 +293,7 @@ class OutcomeFlags(Transform):
         """Registers the flags: collectors drop what is not in the specs."""
         shape = (*observation_spec.shape, 1)
         for name in FLAGS:
-            if name not in observation_spec.keys():
+            if name not in list(observation_spec.keys()):
                 observation_spec[name] = Binary(
                     n=1, shape=shape, dtype=torch.bool, device=observation_spec.device
                 )

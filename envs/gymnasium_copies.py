@@ -92,10 +92,20 @@ class GymnasiumCopy(ForeignCopy):
         self._clock.steps = progress["steps"]
 
     def renderer(self, width: int, height: int, camera: str | int | None) -> CopyRenderer:
-        """Takes the pictures that the environment itself draws, stretched to this size; there is no other camera."""
+        """Takes the pictures that the environment itself draws, stretched to this size; there is no other camera.
+
+        Raises:
+            RuntimeError: if it draws none; the message says why.
+        """
+        if self.env.render_mode != "rgb_array":
+            modes = self.env.metadata.get("render_modes", [])
+            raise RuntimeError(
+                "the environment cannot be drawn: it has no MuJoCo model, and was not made with "
+                f"render_mode='rgb_array'; its render modes are {modes}."
+            )
         from nht.envs.rendering import OwnRenderer
 
-        return OwnRenderer(self.env, width, height, camera)
+        return OwnRenderer(self.env.render, width, height, camera)
 
 
 class MujocoGymnasiumCopy(GymnasiumCopy):

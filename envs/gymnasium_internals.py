@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 from gymnasium.wrappers import TimeLimit
 
-
 GENERATOR = "_np_random"
 """The attribute behind ``gymnasium.Env.np_random``, None until that was asked for."""
 

@@ -1,4 +1,4 @@
-"""Gymnasium's environments through TorchRL's ``GymEnv``: MuJoCo's, the Adroit hand of Gymnasium-Robotics, and others."""
+"""Gymnasium's environments through TorchRL's ``GymEnv``, on MuJoCo or not."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ class Pictures:
         height: int = DEFAULT_SIZE[1],
         camera: str | int | None = None,
     ) -> NDArray[np.uint8]:
-        """Every copy as it stands now, ``(N, height, width, 3)``; arguments and errors as of ``Simulation.renderer``."""
+        """Every copy as it stands now, ``(N, height, width, 3)``; as of ``Simulation.renderer``."""
         view = (width, height, camera)
         if view not in self._renderers:
             self._renderers[view] = self._task.renderer(*view)

@@ -22,8 +22,8 @@ CONSTANT = (
 class PythonState:
     """The attributes of an environment, its wrappers, and the environments that it holds, as far as steps change them.
 
-    Saved are plain ones, numbers, text, arrays, and lists, sets and dicts of them, that are no longer what they were
-    when the environment was made; so that a saved state does not bring back the options of the environment it came from.
+    Saved are plain ones (numbers, text, arrays, and lists, sets and dicts of them) that are no longer what they were
+    when the environment was made: a saved state does not bring back the options of the environment that it came from.
 
     Args:
         env: just made: not reset before.
@@ -97,11 +97,11 @@ class PythonState:
 def _assign(part: gymnasium.Env[Any, Any], name: str, value: Any) -> None:
     """Set an attribute; an array that others may hold, too, gets new numbers instead."""
     there = vars(part).get(name)
-    if isinstance(there, np.ndarray) and isinstance(value, np.ndarray) and there.flags.writeable:
-        if there.shape == value.shape and there.dtype == value.dtype:
-            there[...] = value
-            return
-    setattr(part, name, value)
+    both = isinstance(there, np.ndarray) and isinstance(value, np.ndarray)
+    if both and there.flags.writeable and (there.shape, there.dtype) == (value.shape, value.dtype):
+        there[...] = value
+    else:
+        setattr(part, name, value)
 
 
 def _plain_attributes(part: gymnasium.Env[Any, Any]) -> dict[str, Any]:

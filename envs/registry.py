@@ -140,6 +140,7 @@ TASKS: Table[TaskRecord] = Table(
 FOREIGN: Mapping[str, str] = {
     "dm_control": "nht.envs.dm_control:make_dm_control",
     "gymnasium": "nht.envs.gymnasium_mujoco:make_gymnasium",
+    "torchrl": "nht.envs.torchrl_env:make_torchrl",
 }
 """Where the makers of other libraries' tasks are, by the name of the library."""
 

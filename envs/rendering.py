@@ -8,6 +8,7 @@ import os
 import socket
 import sys
 import weakref
+from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -77,7 +78,7 @@ class CopyRenderer(Protocol):
     """Takes pictures of one copy of an environment of another library."""
 
     def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
-        """The copy as it stands now, ``(height, width, 3)``; ``trail`` as of ``SceneRenderer``, where it can be drawn."""
+        """The copy as it stands now, ``(height, width, 3)``; ``trail`` as of ``Renderer``."""
 
     def close(self) -> None:
         """Release what drawing needs."""
@@ -178,38 +179,37 @@ class OwnRenderer:
     """Takes the pictures that an environment draws itself, and brings them to one size. Trails are left out.
 
     Args:
-        env: made with ``render_mode="rgb_array"``.
+        draw: draws the environment as it stands now, ``(h, w, 3)``.
         width: picture width [pixel].
         height: picture height [pixel].
         camera: there is no choice: None, or 0.
 
     Raises:
-        RuntimeError: if the environment does not draw, or lacks a package for it; the message says what is missing.
         ValueError: for another camera.
     """
 
     def __init__(
-        self, env: gymnasium.Env[Any, Any], width: int, height: int, camera: str | int | None = None
+        self, draw: Callable[[], Any], width: int, height: int, camera: str | int | None = None
     ) -> None:
         if camera not in (None, 0):
             raise ValueError(f"the environment draws itself, through no other camera, got {camera!r}.")
-        if env.render_mode != "rgb_array":
-            raise RuntimeError(
-                f"the environment cannot be drawn: it has neither a MuJoCo model nor the render mode 'rgb_array', "
-                f"only {env.metadata.get('render_modes', [])}."
-            )
-        self._env = env
+        self._draw = draw
         self._size = (height, width)
 
-    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:  # noqa: ARG002
-        """The environment as it stands now, ``(height, width, 3)``."""
+    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The environment as it stands now, ``(height, width, 3)``.
+
+        Raises:
+            RuntimeError: if it draws something else, or lacks a package for it; the message says what is missing.
+        """
         try:
-            picture = self._env.render()
+            picture = self._draw()
         except gymnasium.error.DependencyNotInstalled as error:
             raise RuntimeError(f"the environment cannot be drawn: {error}") from error
-        if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] != 3:
+        picture = np.asarray(picture)
+        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
             raise RuntimeError(
-                f"the environment drew no picture (height, width, 3), but {type(picture).__name__}."
+                f"the environment drew no picture (height, width, 3), but {picture.shape} of {picture.dtype}."
             )
         return resized(picture, self._size)
 

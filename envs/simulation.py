@@ -42,7 +42,7 @@ class Simulation(Protocol):
 
     @property
     def can_resume(self) -> bool:
-        """Whether ``state_dict`` is all that the following steps depend on, so that a loaded one goes on bit for bit."""
+        """Whether ``state_dict`` is all that later steps depend on, so that a loaded one goes on bit for bit."""
 
     @property
     def resume_obstacle(self) -> str:

@@ -347,7 +347,7 @@ class BatchedTask(ABC):
         self.rng.bit_generator.state = saved["rng"]
 
     _episode_arrays: ClassVar[tuple[str, ...]] = ()
-    """Names of the subclass's own per-copy arrays, each with N rows: they are saved, and kept where a copy stands still."""
+    """Names of the subclass's own per-copy arrays, each with N rows: saved, and kept where a copy stands still."""
 
     def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
         """Add what the model does not hold (goals, marks) of copy ``row`` to a rendered scene."""
