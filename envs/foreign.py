@@ -169,18 +169,24 @@ class ForeignEnv(SerialEnv):
         self.set_seed(int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
-        shown = super()._reset(tensordict, **options)
-        self._shown = shown.copy()
-        return shown
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        started = super()._reset(tensordict, **options)
+        shown = started.clone()
+        if mask is not None and self._shown is not None:
+            going_on = ~mask.view(-1)
+            shown[going_on] = self._shown[going_on]
+        self._shown = shown
+        return started
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_step", None)
         stepped = super()._step(tensordict)
         if mask is not None and not mask.all() and self._shown is not None:
-            # TorchRL fills in what the caller showed: whatever transforms have made of it they would do once more.
+            # TorchRL fills in what the caller showed: what transforms have made of that they would do once more.
             still = ~mask.view(-1)
-            stepped = torch.where(still, self._shown.select(*stepped.keys(), strict=False), stepped)
-        self._shown = stepped.copy()
+            stepped[still] = self._shown[still]
+            stepped["reward"][still] = 0.0
+        self._shown = stepped.exclude("reward").clone()
         return stepped
 
     def render(

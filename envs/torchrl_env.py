@@ -31,8 +31,9 @@ def make_torchrl(
     """Copies of an environment of TorchRL.
 
     Its actions must be a vector of numbers under ``"action"``, its observations numbers, not nested. What TorchRL wraps
-    of Gymnasium and dm_control is saved as by ``make_gymnasium`` and ``make_dm_control``, unless transforms stand around
-    it; of others ``task.resume_obstacle`` says why not. They are drawn by their own ``render()``, if they have one.
+    of Gymnasium and dm_control is saved as by ``make_gymnasium`` and ``make_dm_control``, unless transforms stand
+    around it; of others ``task.resume_obstacle`` says why not. They are drawn by their own ``render()``, if they have
+    one.
 
     Args:
         factory: makes one copy, of batch size ``()``: a function, or an import path, ``"my_package.robots:make"``.
