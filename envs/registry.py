@@ -126,6 +126,7 @@ TASKS: Table[TaskRecord] = Table(
 FOREIGN: Mapping[str, str] = {
     "dm_control": "nht.envs.dm_control:make_dm_control",
     "gymnasium": "nht.envs.gymnasium_mujoco:make_gymnasium",
+    "torchrl": "nht.envs.torchrl_env:make_torchrl",
 }
 """Where the makers of other libraries' tasks are, by the name of the library."""
 
@@ -176,7 +177,7 @@ def make_env(
     name: str,
     num_envs: int = 1,
     num_threads: int = 1,
-    seed: int = 0,
+    seed: int | None = None,
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> BatchedMujocoEnv:
@@ -186,7 +187,7 @@ def make_env(
         name: a key of ``TASKS``, e.g. ``"wam_wipe"``, or an import path, ``"my_package.tasks:Pour"``.
         num_envs: number of copies N, the environment's batch size.
         num_threads: native threads that share the copies.
-        seed: seed of every random draw of the task.
+        seed: seed of every random draw of the task; None draws one, so that no two environments are alike.
         device: where the tensors go.
         options: further arguments of the task, e.g. ``start="random"``.
 

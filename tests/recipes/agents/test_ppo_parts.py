@@ -158,7 +158,7 @@ def test_advantages_at_the_end_of_an_episode(terminates):
 
 
 def test_what_is_collected_at_a_time_limit_is_the_episodes_own_last_observation():
-    env = make_env("wam_wipe", 2, start="random", max_episode_steps=3)
+    env = make_env("wam_wipe", 2, start="random", max_episode_steps=3, seed=0)
     features, actor, critic = networks(env, PPOConfig(hidden=[8]))
     policy = TensorDictSequential(features, actor)
     collector = Collector(
@@ -207,7 +207,7 @@ def test_rewards_are_divided_by_the_deviation_of_all_discounted_returns():
 
 
 def test_weights_start_orthogonal():
-    env = make_env("wam_wipe")
+    env = make_env("wam_wipe", seed=0)
     _, actor, critic = networks(env, PPOConfig(hidden=[8, 8], activation="relu", initial_std=0.5))
     for network, last_gain in ((actor.module.network, 0.01), (critic.module, 1.0)):
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
