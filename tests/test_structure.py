@@ -54,6 +54,10 @@ THEIRS = {
 LAYERS = {
     "nht.geometry": 0,
     "nht.networks": 0,
+    "nht.reading": -1,
+    "nht.scratch": 0,
+    "nht.arrays": 0,
+    "nht.memmap": 0,
     "nht.episodes": 0,
     "nht.demos": 1,
     "nht.maps": 1,

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 
 from nht.episodes import whole_episodes
 from nht.hdf5 import D4RL_CONTEXT, hdf5_episodes
+from nht.memmap import read_tensordict
 from nht.minari import minari_episodes, open_minari
 from nht.recipes.config import SourceConfig
 
@@ -67,21 +67,8 @@ def _read_minari(source: SourceConfig) -> Episodes:
 
 
 def load_tensordict(path: str | Path) -> TensorDictBase:
-    """A TensorDict from its folder of memory-mapped files, or from that of a TorchRL storage. Nothing is unpickled.
-
-    Raises:
-        FileNotFoundError: if ``path`` is no such folder.
-        ValueError: if it cannot be read.
-    """
-    folder = Path(path)
-    if not (folder / "meta.json").is_file():
-        raise FileNotFoundError(f"{path} holds no TensorDict: there is no meta.json in it.")
-    try:
-        data = TensorDict.load_memmap(folder, allow_pickle=False)
-        storage = folder / "storage_metadata.json"  # a storage may have room for more than it holds
-        return data[: json.loads(storage.read_text())["len"]] if storage.exists() else data
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise ValueError(f"the TensorDict in {path} cannot be read: {error}") from error
+    """A TensorDict from its folder of raw files, or from that of a TorchRL storage. Raises as ``read_tensordict``."""
+    return read_tensordict(path)
 
 
 def episode_returns(data: TensorDictBase) -> torch.Tensor:
