@@ -104,7 +104,7 @@ def import_demos(
         KeyError: for a key that the file lacks; the message lists those that are there.
         ValueError: if the file cannot be read, its values are not finite, or it does not fit the task.
     """
-    data, left_out, found, expert = read_episodes(source)
+    data, left_out, found, expert, notes = read_episodes(source)
     expected = source.env or env.name
     if found != "unknown" and _bare(found) != _bare(expected):
         raise ValueError(
@@ -114,7 +114,7 @@ def import_demos(
     if min_return is not None:
         data, worse = best_episodes(data, min_return)
         left_out += worse
-    settings = {"source": asdict(source), "min_return": min_return, "left_out_episodes": left_out}
+    settings = {"source": asdict(source), "min_return": min_return, "left_out_episodes": left_out, **notes}
     demos = nht.Demos.from_episodes(data, env=env.name, expert=expert, settings=settings)
     check_fits(demos, env, source.path or "")
     return nht.save_demos(demos.data, path, env=env.name, seed=None, expert=expert, settings=settings)

@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from nht.episodes import whole_episodes
 from nht.hdf5 import D4RL_CONTEXT, hdf5_episodes
 from nht.memmap import read_tensordict
-from nht.minari import minari_episodes, open_minari
+from nht.minari import left_out_observations, minari_episodes, open_minari
 from nht.recipes.config import SourceConfig
 
 
@@ -23,6 +23,8 @@ class Episodes(NamedTuple):
     """Episodes that do not end."""
     env: str = "unknown"
     expert: str = "unknown"
+    notes: dict[str, list[str]] = {}  # noqa: RUF012 - never changed
+    """What else a manifest's settings should say."""
 
 
 def read_episodes(source: SourceConfig) -> Episodes:
@@ -63,7 +65,8 @@ def _read_minari(source: SourceConfig) -> Episodes:
     dataset = open_minari(source.path or "")
     data, left_out = minari_episodes(dataset, source.context or None)
     env = dataset.env_spec.id if dataset.env_spec is not None else "unknown"
-    return Episodes(data, left_out, env, dataset.storage.metadata.get("algorithm_name", "unknown"))
+    expert = dataset.storage.metadata.get("algorithm_name", "unknown")
+    return Episodes(data, left_out, env, expert, left_out_observations(dataset, source.context or None))
 
 
 def load_tensordict(path: str | Path) -> TensorDictBase:
