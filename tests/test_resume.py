@@ -175,7 +175,7 @@ def test_memory_mapped_parts_that_were_changed_are_noticed(whole, tmp_path):
     _, newest = broken_off(whole, tmp_path / "run")
     rewritten(newest, change_weights)
     with pytest.warns(
-        UserWarning, match=r"checkpoint-000000000600.*was changed since it was written: its checksum"
+        UserWarning, match=r"checkpoint-\d+.*was changed since it was written: its checksum"
     ):
         metrics = train(whole[0], tmp_path / "run", "run.resume=true")
     assert_same(tmp_path / "run", metrics, whole)
@@ -190,7 +190,7 @@ def test_networks_that_are_not_finite_are_refused(whole, tmp_path):
         checkpoint.unlink()
         write_checkpoint(checkpoint, states)
     with pytest.raises(
-        ValueError, match=r"checkpoint-0+600.torchrl, 'loss': .*weight holds 1 NaN or infinite"
+        ValueError, match=r"checkpoint-\d+.torchrl, 'loss': .*weight holds 1 NaN or infinite"
     ):
         train(whole[0], tmp_path / "run", "run.resume=true")
 

@@ -1,4 +1,4 @@
-"""The file of a checkpoint: state dictionaries in one archive, in the layout of TorchRL's, written and read without pickle.
+"""The file of a checkpoint: state dictionaries in one archive in TorchRL's layout, written and read without pickle.
 
 An archive is a ZIP file of members that are stored, not compressed. For each part it has ``state.json``, which says how
 dictionaries, lists and numbers are nested, and a raw file for each tensor with a ``meta.json`` beside them; and
