@@ -1,4 +1,7 @@
-"""Every task by its Gymnasium id: known after ``import nht.envs``, or by naming the module, ``"nht.envs:nht/WAMWipe-v0"``."""
+"""Every task by its Gymnasium id.
+
+Gymnasium knows them after ``import nht.envs``, or where an id names the module: ``"nht.envs:nht/WAMWipe-v0"``.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from nht.envs.registry import TASKS
 
 
 def gymnasium_id(task: str) -> str:
-    """Gymnasium's id of a task of the table: ``"pour_tea"`` is ``"nht/PourTea-v0"``, unless its record says otherwise."""
+    """Gymnasium's id of a task: ``"pour_tea"`` is ``"nht/PourTea-v0"``, unless our table says otherwise."""
     own = TASKS.own(task)
     if own is not None and own.gymnasium_id is not None:
         return own.gymnasium_id

@@ -173,3 +173,13 @@ def _fill(map: ActionMap, tensors: dict[str, Tensor], path: Path) -> None:
                 f"{tuple(tensors[name].shape)}, expected {dtype} {tuple(value.shape)}"
             )
     map.to(precision).load_state_dict(tensors)
+
+
+def format_version(path: str | Path) -> int:
+    """The format version of a map file.
+
+    Raises:
+        FileNotFoundError, ValueError: as `load_map`.
+    """
+    header, _ = _read(Path(path))
+    return int(header.get("format_version", "0"))

@@ -17,14 +17,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import nht
 from nht.envs import make_env
-from nht.envs.registry import TASKS
-from nht.recipes.agents.networks import load_policy
-from nht.recipes.config import CollectDemos, DemosConfig, EnvConfig, SourceConfig
+from nht.recipes.agents.policy import load_policy
+from nht.recipes.config import CollectDemos
 from nht.recipes.data.files import FILES, best_episodes, read_episodes
 from nht.recipes.data.recording import COPIES, endings, has_success, record, record_expert
 from nht.recipes.launch import launch
+from nht.recipes.maps.kinds import known_task, task_context_keys
 from nht.recipes.run.environments import mapped_env
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.folder import kept_map, read_config
+from nht.recipes.sections import DemosConfig, EnvConfig, SourceConfig
 
 
 def main(config: CollectDemos) -> None:
@@ -72,9 +73,8 @@ def record_policy(
         raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
     options = trained.env.options | endings(env.name)
     task_config = replace(trained.env, options=options, num_threads=env.num_threads)
-    map = nht.load_map(folder / "map.safetensors")
-    simulation = mapped_env(task_config, map, trained.map.action_scale, seed=seed, num_envs=COPIES)
-    policy = load_policy(folder, simulation, trained.algo)
+    simulation = mapped_env(task_config, kept_map(folder, trained), seed=seed, num_envs=COPIES)
+    policy = load_policy(folder, simulation, trained)
     with closing(simulation), set_exploration_type(ExplorationType.DETERMINISTIC):
         data, left_out = record(
             simulation,
@@ -127,8 +127,8 @@ def check_fits(demos: nht.Demos, env: EnvConfig, name: str) -> None:
         KeyError: for a context key that they lack.
         ValueError: for another width.
     """
-    found = {key: demos.context([key]).shape[-1] for key in env.context_keys}
-    if env.name not in TASKS:
+    found = {key: demos.context([key]).shape[-1] for key in task_context_keys(env)}
+    if known_task(env) is None:
         return
     task = make_env(env.name, seed=0, **env.options)
     task.close()

@@ -21,9 +21,9 @@ import nht
 from nht.recipes.config import CompareMaps
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
-from nht.recipes.train_map import ARMS, KINDS, arm_of, train_map
+from nht.recipes.maps.interface import train_map
+from nht.recipes.maps.kinds import arm_of, find_kind, tasks_with_arm
 
-FIXED = ("jacobian", "none")  # kinds whose action has the width it has
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
 
@@ -47,14 +47,13 @@ def main(config: CompareMaps) -> None:
         raise FileExistsError(f"{out} exists: comparisons are never overwritten. Choose another folder.")
     if config.demos.path is None:
         raise ValueError("demos.path must name the demonstrations that all maps are trained on.")
-    if unknown := set(config.maps) - KINDS.keys():
-        raise ValueError(f"unknown map kinds {sorted(unknown)}: choose from {sorted(KINDS)}.")
+    fixed = {kind for kind in config.maps if find_kind(kind).fixed_width}
     if not config.maps or not config.action_dims:
         raise ValueError(f"nothing to compare: got maps={config.maps} and action_dims={config.action_dims}.")
     demos = nht.load_demos(config.demos.path, env=config.env.name)
     rows, maps = [], {}
     for kind in config.maps:
-        for action_dim in config.action_dims[:1] if kind in FIXED else config.action_dims:
+        for action_dim in config.action_dims[:1] if kind in fixed else config.action_dims:
             trained = _trained(config, kind, action_dim)
             maps[kind, trained.map.action_dim] = trained.map
             rows.append({"map": kind, "k": trained.map.action_dim, **_measured(trained, demos)})
@@ -71,11 +70,8 @@ def main(config: CompareMaps) -> None:
 
 
 def _trained(config: CompareMaps, kind: str, action_dim: int) -> nht.MapTraining:
-    env = config.env
-    if kind == "jacobian":
-        env = replace(env, context_keys=["joint_angle"])
     settings = replace(config.map, kind=kind, action_dim=action_dim)
-    return train_map(settings, env, config.demos, config.seed)
+    return train_map(settings, config.env, config.demos, config.seed)
 
 
 def _measured(trained: nht.MapTraining, demos: nht.Demos) -> dict[str, float]:
@@ -138,12 +134,12 @@ def _draw(
     """The figures of the maps with ``map.action_dim`` axes, or else the first of ``action_dims``."""
     dims = config.action_dims
     axes = config.map.action_dim if config.map.action_dim in dims else dims[0]
-    chosen = {kind: map for (kind, k), map in maps.items() if k == axes or kind in FIXED}
-    with_columns = {kind: map for kind, map in chosen.items() if kind not in FIXED}
+    chosen = {kind: map for (kind, k), map in maps.items() if k == axes or find_kind(kind).fixed_width}
+    with_columns = {kind: map for kind, map in chosen.items() if not find_kind(kind).fixed_width}
     if with_columns:
         longest = int(demos.episode.bincount().argmax())
         basis_figure(with_columns, demos, longest, out / "basis.png")
-    if config.env.name in ARMS:
+    if config.env.name in tasks_with_arm():
         tool_figure(chosen, demos, arm_of(config.env.name), axes, out / "tool.png")
 
 

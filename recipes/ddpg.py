@@ -10,39 +10,31 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from nht.recipes.agents.losses import (
-    JointSoftUpdate,
-    PaperDDPGLoss,
-    charge_failure,
-    n_step_returns,
-    reward_range,
-)
-from nht.recipes.agents.networks import ddpg_networks, exploring
-from nht.recipes.config import DDPG
+from nht.recipes.agents.ddpg import DDPG, PaperDDPGLoss, networks
+from nht.recipes.agents.off_policy import STORED, JointSoftUpdate, exploring
+from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch
+from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
-from nht.recipes.run.training import TrainingRun
-
-STORED = (
-    "observation",
-    "action",
-    ("next", "observation"),
-    ("next", "reward"),
-    ("next", "done"),
-    ("next", "terminated"),
-    "steps_to_next_obs",
-)
+from nht.recipes.run.record import Record
 
 
 def main(config: DDPG) -> None:
     """Train, evaluate on the way, and say at the end what happened."""
     algo = config.algo
-    run = TrainingRun(config, losses=["loss_actor", "loss_value"])
-    features, actor, critic = ddpg_networks(run.env, algo)
-    policy = TensorDictSequential(features, actor)
+    ranks = Ranks(config.device, seed=config.seed, threads=config.torch_threads)
+    folder = RunFolder(config, ranks)
+    if folder.whole:
+        return folder.show()
+    envs = RunEnvs(folder.config, folder.map, ranks)
+    record = Record(folder, ranks, envs, losses=["loss_actor", "loss_value"])
 
-    rewards = reward_range(run.env)
+    features, actor, critic = networks(envs.train, algo)
+    policy = TensorDictSequential(features, actor)
+    rewards = reward_range(envs.train)
     loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
@@ -54,30 +46,32 @@ def main(config: DDPG) -> None:
         fused=True,
     )
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(run.ranks.share("algo.buffer_size", algo.buffer_size), device=run.device),
+        storage=LazyTensorStorage(ranks.share("algo.buffer_size", algo.buffer_size), device=ranks.device),
     )
-    batch_size = run.ranks.share("algo.batch_size", algo.batch_size)
-    collector = run.collector(exploring(policy, run.env, algo), random_frames=algo.random_frames)
+    batch_size = ranks.share("algo.batch_size", algo.batch_size)
+    parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
+    explorer = exploring(policy, envs.train, algo)
+    loop = Loop(folder, ranks, envs, record, explorer, loss, random_frames=algo.random_frames, **parts)
 
-    with run.training(collector, loss, optimiser=optimiser, features=features, buffer=buffer) as batches:
-        for data in batches:
-            run.count_steps(data)
-            features.module.update(data["observation"], run.ranks.sum)
+    with loop.batches() as batches:
+        for data in batches:  # (copies, steps)
+            record.count_steps(data)
+            features.module.update(data["observation"], ranks.sum)
             data = look_ahead(charge_failure(data, algo.gamma, rewards)).reshape(-1)
             buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
 
-            if run.counters.frames >= algo.warmup_frames and algo.updates_per_batch:
-                replay = buffer.sample(algo.updates_per_batch * batch_size).to(run.device)
+            if record.frames >= algo.warmup_frames and algo.updates_per_batch:
+                replay = buffer.sample(algo.updates_per_batch * batch_size).to(ranks.device)
                 with torch.no_grad():
                     features(replay), features(replay["next"])
                 for batch in replay.split(batch_size):
-                    run.count_update(descend(batch, loss, optimiser, run.ranks))
-                    if run.counters.updates % algo.target_update_every == 0:
+                    record.count_update(descend(batch, loss, optimiser, ranks))
+                    if record.counters.updates % algo.target_update_every == 0:
                         target.step()
 
-            if run.evaluation_due:
-                run.log(evaluate(run.tests, policy))
-    run.finish(policy)
+            if record.evaluation_due:
+                record.log(evaluate(envs.test, policy))
+    loop.finish(policy)
 
 
 def descend(

@@ -10,13 +10,12 @@ from pathlib import Path
 
 from torchrl.envs import TransformedEnv
 
-import nht
-from nht.recipes.agents.networks import load_policy
+from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import Evaluate
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import lasting_failures, mapped_env
 from nht.recipes.run.evaluation import evaluate
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.folder import kept_map, read_config
 from nht.recipes.run.video import record_video
 
 
@@ -26,13 +25,13 @@ def main(config: Evaluate) -> None:
     trained = read_config(folder)
     env = lasting_failures(trained.env)
     env = replace(env, options=env.options | config.env_options)
-    map = nht.load_map(folder / "map.safetensors")
+    map = kept_map(folder, trained)
 
     def build(copies: int) -> TransformedEnv:
-        return mapped_env(env, map, trained.map.action_scale, seed=config.seed, num_envs=copies)
+        return mapped_env(env, map, seed=config.seed, num_envs=copies)
 
     tests = build(config.episodes)
-    policy = load_policy(folder, tests, trained.algo)
+    policy = load_policy(folder, tests, trained)
     outcome = evaluate(tests, policy)
     for name, value in outcome.metrics().items():
         print(f"{name:>12}  {value:.3f}")

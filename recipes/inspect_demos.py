@@ -24,9 +24,10 @@ from tensordict import TensorDictBase
 
 import nht
 from nht.episodes import items, key_name
-from nht.recipes.config import InspectDemos, SourceConfig
+from nht.recipes.config import InspectDemos
 from nht.recipes.data.files import Episodes, episode_returns, read_episodes
 from nht.recipes.launch import launch
+from nht.recipes.sections import SourceConfig
 
 BINS = 30
 TRACES = 3  # episodes whose actuation is drawn

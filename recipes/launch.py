@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, is_dataclass, replace
+from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from hydra import compose, initialize_config_module
@@ -13,7 +17,16 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from nht.envs import TASKS
+from nht.recipes.maps.kinds import KINDS
+from nht.recipes.sections import Training
+
 Config = TypeVar("Config")
+
+NAMED = {"env": TASKS, "map": KINDS}
+"""Groups whose choices need no YAML: what the table has, ``env=my_package.tasks:Pour``, is a choice, too."""
+EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, RuntimeError)
+"""Errors that say by themselves what is wrong; HYDRA_FULL_ERROR=1 shows where they come from."""
 
 
 def launch(
@@ -24,7 +37,7 @@ def launch(
     Args:
         main: the recipe.
         schema: dataclass that ``main`` takes.
-        name: YAML file under ``configs/`` that holds the recipe's values.
+        name: YAML file under ``configs/`` that holds the recipe's values; a recipe may do without.
         positional: setting that a word without a key sets: ``PATH`` is short for ``positional=PATH``.
     """
     arguments = sys.argv[1:] if positional is None else [_keyed(word, positional) for word in sys.argv[1:]]
@@ -33,29 +46,59 @@ def launch(
         print(OmegaConf.to_yaml(_compose(schema, name, [])))
         return
     try:
-        config = configure(schema, name, arguments)
-    except ValueError as error:
-        sys.exit(f"error: {error}")
-    main(config)
+        main(configure(schema, name, arguments))
+    except EXPECTED as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        sys.exit(f"error: {_message(error)}")
+
+
+def _message(error: BaseException) -> str:
+    return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
 
 
 def _keyed(word: str, positional: str) -> str:
-    """A word of the command line as a Hydra override; quoted, for a path may hold any character."""
-    if "=" in word or word.startswith("-"):
+    """A word of the command line as a Hydra override; a path may hold any character, an equals sign included."""
+    key, equals, _ = word.partition("=")
+    if word.startswith("-") or (
+        equals and re.fullmatch(r"[+~]{0,2}[A-Za-z_][\w./@]*", key) and "/" not in key
+    ):
         return word
     return f"{positional}={_quoted(word)}"
 
 
 def _quoted(text: str) -> str:
-    escaped = text.replace("'", r"\'")
+    escaped = re.sub(r"(\\+)(?='|$)", r"\1\1", text).replace("'", r"\'")
     return f"'{escaped}'"
 
 
 def _as_text(schema: type[Any], word: str) -> str:
     """An override with its value quoted if it is text, as titles and paths are: these may hold commas and the like."""
-    key, _, value = word.partition("=")
-    is_text = any(entry.name == key and entry.type == "str" for entry in fields(schema))
-    return word if not is_text or value[:1] in ("'", '"') else f"{key}={_quoted(value)}"
+    key, equals, value = word.partition("=")
+    if not equals or _is_quoted(value) or value in ("null", "???"):
+        return word
+    return f"{key}={_quoted(value)}" if _is_text(schema, key.lstrip("+")) else word
+
+
+def _is_quoted(value: str) -> bool:
+    return len(value) > 1 and value[0] == value[-1] and value[0] in ("'", '"')
+
+
+def _is_text(schema: type[Any], key: str) -> bool:
+    """Whether the field at a dotted name holds text."""
+    node: Any = schema
+    *outer, last = key.split(".")
+    for part in outer:
+        node = next((_section(entry) for entry in fields(node) if entry.name == part), None)
+        if node is None:
+            return False
+    return any(entry.name == last and str(entry.type) in ("str", "str | None") for entry in fields(node))
+
+
+def _section(entry: Any) -> Any:
+    """The dataclass that a field holds, if it holds one."""
+    made = entry.default_factory() if callable(entry.default_factory) else None
+    return type(made) if is_dataclass(made) else None
 
 
 def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) -> Config:
@@ -75,17 +118,72 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
             "Hydra's multirun (-m) is not supported: start one process for each run."
         )
     try:
-        texts = [_as_text(schema, word) for word in overrides]
-        return cast(Config, OmegaConf.to_object(_compose(schema, name, texts)))
+        texts = [_as_text(schema, word) for word in _named(schema, overrides)]
+        return cast(Config, _at_home(OmegaConf.to_object(_compose(schema, name, texts))))
     except (HydraException, OmegaConfBaseException) as error:
         reason = str(error.__cause__ or error).splitlines()[0]
         raise ValueError(f"{str(error).splitlines()[0]} ({reason}){_existing(schema, error)}") from error
 
 
-def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
-    ConfigStore.instance().store(name=f"{name}_schema", node=_opened(OmegaConf.structured(schema)))
+def _named(schema: type[Any], overrides: Sequence[str]) -> Iterator[str]:
+    """Overrides in which a choice that has no YAML of ours is the name that a table of ours knows."""
+    for word in overrides:
+        key, _, value = word.partition("=")
+        known = NAMED.get(key)
+        if known is None or not any(entry.name == key for entry in fields(schema)):
+            yield word
+        elif value in known and not _has_yaml(key, value):
+            if key == "env":
+                yield "env=named"
+            yield f"{key}.{'name' if key == 'env' else 'kind'}={_quoted(value)}"
+        else:
+            yield word
+
+
+def _has_yaml(group: str, choice: str) -> bool:
+    from hydra.core.global_hydra import GlobalHydra
+
     with initialize_config_module("nht.configs", version_base="1.3"):
-        return compose(name, overrides=list(overrides))
+        loader = GlobalHydra.instance().config_loader()
+        return choice in loader.get_group_options(group)
+
+
+def _at_home(config: Any) -> Any:
+    """A configuration in whose paths ``~`` is the user's home."""
+    changed: dict[str, Any] = {}
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        if is_dataclass(value):
+            _at_home(value)
+        elif entry.metadata.get("path") and isinstance(value, str) and value.startswith("~"):
+            setattr(config, entry.name, str(Path(value).expanduser()))
+    return replace(config, **changed) if changed else config
+
+
+def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
+    store = ConfigStore.instance()
+    store.store(name=f"{name}_schema", node=_opened(OmegaConf.structured(schema)))
+    with initialize_config_module("nht.configs", version_base="1.3"):
+        search = [f"pkg://{found.value}" for found in entry_points(group="nht.configs")]
+        more = [f"hydra.searchpath=[{','.join(search)}]"] if search else []
+        return compose(_primary(schema, name), overrides=[*more, *overrides])
+
+
+def _primary(schema: type[Any], name: str) -> str:
+    """The recipe's YAML file; of a recipe without one, what any training starts from."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    if name in loader.get_group_options(""):
+        return name
+    groups: list[Any] = [f"{name}_schema"]
+    if issubclass(schema, Training):
+        groups += [{"env": "wam_wipe"}, {"map": "nht"}, {"collector": "single"}]
+    node = {"defaults": [*groups, "_self_"]}
+    if issubclass(schema, Training):
+        node["run"] = {"folder": f"runs/{name}-${{env.name}}-${{map.kind}}-seed${{seed}}"}  # type: ignore[assignment]
+    ConfigStore.instance().store(name=name, node=node)
+    return name
 
 
 def _opened(node: DictConfig) -> DictConfig:

@@ -17,23 +17,17 @@ from typing import Any, cast
 import pandas
 from tqdm import tqdm
 
+from nht.recipes.agents.table import find_algorithm
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import configure, launch
+from nht.recipes.maps.kinds import KINDS, MapKind, find_kind, tasks_with_arm
+from nht.recipes.run.ownership import claimed
 from nht.recipes.study.cluster import Cluster
-from nht.recipes.study.jobs import (
-    RECIPES,
-    Outcome,
-    Task,
-    claimed,
-    rows_of,
-    run_task,
-    task_name,
-)
+from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
 from nht.recipes.study.report import summary
 from nht.recipes.study.results import COLUMNS, SearchResults, read_results
 from nht.recipes.study.space import draw, write_manifest
-from nht.recipes.train_map import ARMS, KINDS
 from nht.storage import replacing
 
 FRESH = 100
@@ -48,55 +42,65 @@ def main(config: Search) -> None:
     search, folder = config.search, Path(config.folder).resolve()
     check_interfaces(search)
     demos = Path(config.demos.path or folder / "demos").resolve()
-    tasks = search_tasks(search, demos)
-    check_settings(tasks, folder)
+    jobs = search_jobs(search, demos)
+    check_settings(jobs, folder)
     write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
         if config.demos.path is None:
             record_demos(config, folder, demos)
         ended = known_rows(folder, config.retry_failed)
-        run_all(tasks, folder, cluster, ended)
+        run_all(jobs, folder, cluster, ended)
         if search.best_seeds:
-            run_all(best_tasks(search, demos, ended), folder, cluster, ended)
+            run_all(best_jobs(search, demos, ended), folder, cluster, ended)
     print(summary(SearchResults.of(together(ended))).to_string(index=False))
     print(f"\n{folder}: manifest.json, rows.csv; figures: python -m nht.recipes.report {config.folder}")
 
 
 def check_interfaces(search: SearchConfig) -> None:
-    """Raise ValueError for an interface that does not exist, or not on the task."""
-    known = ["raw", *sorted(KINDS.keys() - {"none"})]
-    if unknown := [name for name in search.interfaces if name not in known]:
-        raise ValueError(f"unknown search.interfaces {unknown}: choose from {known}.")
+    """Raise ValueError for an interface that does not exist, or not on the job."""
     if not search.interfaces:
-        raise ValueError(f"search.interfaces is empty: choose from {known}.")
-    if "jacobian" in search.interfaces and search.env not in ARMS:
-        raise ValueError(
-            f"the interface jacobian needs an arm: {sorted(ARMS)} have one, {search.env!r} does not."
-        )
+        raise ValueError(f"search.interfaces is empty: choose from {interfaces()}.")
+    for interface in search.interfaces:
+        if interface not in ("raw", *KINDS):
+            raise ValueError(f"unknown search.interfaces {interface!r}: choose from {interfaces()}.")
+        if kind_of(interface).needs_arm and search.env not in tasks_with_arm():
+            raise ValueError(
+                f"the interface {interface} needs an arm: {tasks_with_arm()} have one, {search.env!r} does not."
+            )
 
 
-def search_tasks(search: SearchConfig, demos: Path) -> list[Task]:
+def interfaces() -> list[str]:
+    """What may be compared: every kind of map, and raw actuation, which is the kind ``none``."""
+    return ["raw", *(name for name in KINDS if name != "none")]
+
+
+def kind_of(interface: str) -> MapKind:
+    """The kind of map that an interface is."""
+    return find_kind("none" if interface == "raw" else interface)
+
+
+def search_jobs(search: SearchConfig, demos: Path) -> list[Job]:
     """Every run of the search, those of all interfaces of one configuration and seed after each other."""
     return [
-        make_task(search, demos, "search", interface, configuration, seed, search.total_frames)
+        make_job(search, demos, "search", interface, configuration, seed, search.total_frames)
         for configuration in range(search.configs)
         for seed in range(search.seeds)
         for interface in search.interfaces
     ]
 
 
-def best_tasks(search: SearchConfig, demos: Path, ended: Rows) -> list[Task]:
+def best_jobs(search: SearchConfig, demos: Path, ended: Rows) -> list[Job]:
     """The best configuration of each interface, on fresh seeds."""
     results = SearchResults.of(together(ended))
     best = {interface: results.best(interface)[0] for interface in search.interfaces}
     return [
-        make_task(search, demos, "best", interface, configuration, FRESH + seed, search.best_frames)
+        make_job(search, demos, "best", interface, configuration, FRESH + seed, search.best_frames)
         for seed in range(search.best_seeds)
         for interface, configuration in best.items()
     ]
 
 
-def make_task(
+def make_job(
     search: SearchConfig,
     demos: Path,
     stage: str,
@@ -104,18 +108,18 @@ def make_task(
     configuration: int,
     seed: int,
     frames: int,
-) -> Task:
+) -> Job:
     """One run: what a person would type."""
     parameters = draw(search.space, search.seed, configuration, interface)
     told = dict(parameters)
     if "map.hidden_layers" in told:
         told["map.hidden"] = str(int(told.pop("map.hidden_layers")) * [told.pop("map.hidden_units")])
     overrides = [f"env={search.env}", f"map={'none' if interface == 'raw' else interface}"]
-    overrides += [] if interface in ("raw", "jacobian") else [f"map.action_dim={search.action_dim}"]
+    overrides += [] if kind_of(interface).fixed_width else [f"map.action_dim={search.action_dim}"]
     overrides += [f"demos.path={demos}", *search.base, *(f"{name}={value}" for name, value in told.items())]
     overrides += [f"seed={seed}", f"algo.total_frames={frames}"]
     overrides += [f"run.wandb_group={stage}-{configuration:03d}", f"run.wandb_job_type={interface}"]
-    return Task(
+    return Job(
         stage=stage,
         env=search.env,
         interface=interface,
@@ -128,11 +132,11 @@ def make_task(
     )
 
 
-def check_settings(tasks: Sequence[Task], folder: Path) -> None:
+def check_settings(jobs: Sequence[Job], folder: Path) -> None:
     """Raise ValueError if a recipe does not take what it would be told, before anything is run."""
-    for task in {task.interface: task for task in tasks}.values():
-        _, schema = RECIPES[task.recipe]
-        configure(schema, task.recipe, [*task.overrides, f"run.folder={folder}"])
+    for job in {job.interface: job for job in jobs}.values():
+        schema = find_algorithm(job.recipe).schema
+        configure(schema, job.recipe, [*job.overrides, f"run.folder={folder}"])
 
 
 def record_demos(config: Search, folder: Path, demos: Path) -> None:
@@ -149,47 +153,47 @@ def record_demos(config: Search, folder: Path, demos: Path) -> None:
 
 def task_env(search: SearchConfig) -> Any:
     """The configuration of the environment that all runs have."""
-    _, schema = RECIPES[search.recipe]
+    schema = find_algorithm(search.recipe).schema
     return configure(schema, search.recipe, [f"env={search.env}", "map=none", *search.base]).env
 
 
-def run_all(tasks: Sequence[Task], folder: Path, cluster: Cluster, ended: Rows) -> None:
-    """Run those tasks of a stage that have not ended, and keep ``rows.csv`` up to date.
+def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: Rows) -> None:
+    """Run those jobs of a stage that have not ended, and keep ``rows.csv`` up to date.
 
     Args:
-        tasks: of one stage.
+        jobs: of one stage.
         folder: of the search.
         cluster: where they run.
         ended: the rows of all runs that have, which grows.
     """
     ended |= {
-        task.name: rows_of(task, folder)
-        for task in tasks
-        if task.name not in ended and Outcome.read(folder / task.name) is not None
+        job.name: rows_of(job, folder)
+        for job in jobs
+        if job.name not in ended and Ending.read(folder / job.name) is not None
     }
-    with progress(tasks, folder) as show:
+    with progress(jobs, folder) as show:
         show(ended)
-        while missing := [task for task in tasks if task.name not in ended]:
-            for task in cluster.run(run_task, missing, folder):
-                if Outcome.read(folder / task.name) is None:
+        while missing := [job for job in jobs if job.name not in ended]:
+            for job in cluster.run(run_job, missing, folder):
+                if Ending.read(folder / job.name) is None:
                     continue  # another process is at it
-                ended[task.name] = rows_of(task, folder)
+                ended[job.name] = rows_of(job, folder)
                 write_rows(folder, ended)
                 show(ended)
-            if any(task.name not in ended for task in tasks):
+            if any(job.name not in ended for job in jobs):
                 time.sleep(POLL)
     write_rows(folder, ended)
 
 
 @contextmanager
-def progress(tasks: Sequence[Task], folder: Path) -> Iterator[Callable[[Rows], None]]:
+def progress(jobs: Sequence[Job], folder: Path) -> Iterator[Callable[[Rows], None]]:
     """A bar over the runs of a stage."""
-    stage = tasks[0].stage
+    stage = jobs[0].stage
     # The mean rate, not the latest: runs of one configuration end together, and configurations differ.
-    with tqdm(total=len(tasks), desc=f"{folder.name}, {stage}", unit="run", smoothing=0) as bar:
+    with tqdm(total=len(jobs), desc=f"{folder.name}, {stage}", unit="run", smoothing=0) as bar:
 
         def show(ended: Rows) -> None:
-            own = [ended[task.name] for task in tasks if task.name in ended]
+            own = [ended[job.name] for job in jobs if job.name in ended]
             failed = sum(rows["status"].iloc[0] != "done" for rows in own)
             running = len(list((folder / "claims").glob(f"{stage}-*")))
             if bar.n == 0:
@@ -201,7 +205,7 @@ def progress(tasks: Sequence[Task], folder: Path) -> Iterator[Callable[[Rows], N
 
 
 Rows = dict[str, pandas.DataFrame]
-"""The rows of runs that have ended, by the task's name."""
+"""The rows of runs that have ended, by the job's name."""
 
 
 def known_rows(folder: Path, retry_failed: bool) -> Rows:
@@ -215,7 +219,7 @@ def known_rows(folder: Path, retry_failed: bool) -> Rows:
     known = {}
     for place, rows in found.groupby(["stage", "interface", "configuration", "seed"], sort=False):
         stage, interface, configuration, seed = cast(tuple[str, str, int, int], place)
-        name = task_name(stage, interface, configuration, seed)
+        name = job_name(stage, interface, configuration, seed)
         if retry_failed and rows["status"].iloc[0] != "done":
             shutil.rmtree(folder / name, ignore_errors=True)
         else:

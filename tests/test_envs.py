@@ -1,8 +1,8 @@
 """What every task promises, whatever it is about: these tests run over all of ``nht.envs.TASKS``.
 
 The file that a task's record names as ``golden`` holds its first steps (copy 0 of two, seed 0, after three steps of
-`random_actions`: what the policy sees, and the three rewards) and, as ``constant``, the entries of its observations that
-are the same in every state of every episode, or at least of these short ones.
+`random_actions`: what the policy sees, and the three rewards) and, as ``constant``, the entries of its observations
+that are the same in every state of every episode, or at least of these short ones.
 """
 
 import inspect
@@ -96,7 +96,9 @@ def test_no_observation_entry_is_constant(name):
         for entry in range(size)
         if (data["next", key][:, entry] == data["next", key][0, entry]).all()
     }
-    assert constant == {(key, entry) for key, entries in golden(name)["constant"].items() for entry in entries}
+    assert constant == {
+        (key, entry) for key, entries in golden(name)["constant"].items() for entry in entries
+    }
 
 
 def test_flags_agree(name):

@@ -12,7 +12,7 @@ from nht.episodes import whole_episodes
 from nht.hdf5 import D4RL_CONTEXT, hdf5_episodes
 from nht.memmap import read_tensordict
 from nht.minari import left_out_observations, minari_episodes, open_minari
-from nht.recipes.config import SourceConfig
+from nht.recipes.sections import SourceConfig
 
 
 class Episodes(NamedTuple):

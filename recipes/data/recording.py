@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable
 from contextlib import closing
@@ -15,9 +14,9 @@ from tqdm import tqdm
 
 import nht
 from nht.envs import make_env, make_expert
-from nht.envs.registry import TASKS
+from nht.envs.registry import TASKS, find_task
 from nht.envs.task import BatchedTask
-from nht.recipes.config import DemosConfig, EnvConfig
+from nht.recipes.sections import DemosConfig, EnvConfig
 
 COPIES = 100
 FLAGS = ("reward", "success", "terminated", "truncated", "done")
@@ -55,13 +54,12 @@ def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Pat
 
 def endings(task: str) -> dict[str, bool]:
     """The options that end a task's episodes at success and at failure, as far as it knows these."""
-    known = inspect.signature(TASKS[task]).parameters if task in TASKS else {}
-    return {name: True for name in ("terminate_on_success", "terminate_on_failure") if name in known}
+    return find_task(task).endings if task in TASKS else {}
 
 
 def has_success(task: str) -> bool:
     """Whether a task has a notion of success: whether its episodes can end there."""
-    return "terminate_on_success" in endings(task)
+    return task in TASKS and find_task(task).has_success
 
 
 @torch.no_grad()

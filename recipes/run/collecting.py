@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import TransformedEnv
 
-from nht.recipes.config import CollectorConfig
+from nht.recipes.sections import CollectorConfig
 
 
 class MakeEnv(Protocol):

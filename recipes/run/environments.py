@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import torch
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 import nht
-from nht.envs import FOREIGN, BatchedMujocoEnv, ForeignEnv, make_env
-from nht.recipes.config import EnvConfig, Training
-from nht.recipes.train_map import load_kind, train_map
+from nht.envs import FOREIGN, make_env
+from nht.envs.table import imported
+from nht.recipes.run.collecting import MakeEnv, worker_seed
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.sections import EnvConfig, Training
 from nht.transforms import ActionMapTransform
+
+TEST_SEED = 1_000_000
+"""Added to a run's seed, so that test episodes are never those of the training."""
 
 
 def mapped_env(
     env: EnvConfig,
     map: nht.ActionMap,
-    action_scale: float | None,
     *,
     seed: int,
     num_envs: int | None = None,
@@ -28,8 +32,7 @@ def mapped_env(
 
     Args:
         env: which task.
-        map: from action and context to actuation.
-        action_scale: actuation per unit of action; None takes the map's own.
+        map: from action and context to actuation; it says what an action means.
         seed: of the task's random draws.
         num_envs: number of copies, if another than the configuration's.
         device: where the tensors go.
@@ -38,25 +41,19 @@ def mapped_env(
         KeyError, ValueError: if the map does not fit the task: the keys or widths of its context, its actuation.
     """
     base = base_env(env, seed=seed, num_envs=num_envs, device=device)
-    context_keys = env.context_keys if map.context_dim else None
-    mapped = TransformedEnv(base, ActionMapTransform(map, context_keys, action_scale=action_scale))
-    if context_keys and map.context_keys is not None and list(map.context_keys) != context_keys:
-        raise ValueError(
-            f"the map was trained on the observations {list(map.context_keys)}, env.context_keys are {context_keys}."
-        )
-    return mapped
+    return TransformedEnv(base, ActionMapTransform(map))
 
 
 def base_env(
     env: EnvConfig, *, seed: int, num_envs: int | None = None, device: torch.device | str = "cpu"
-) -> BatchedMujocoEnv | ForeignEnv:
+) -> EnvBase:
     """The task itself, driven by actuations; arguments as of ``mapped_env``.
 
     Raises:
         ImportError: if the suite that the task belongs to is not installed.
         ValueError: for an unknown suite, task or option, or threads where copies are stepped one after the other.
     """
-    copies = num_envs or env.num_envs
+    copies = num_envs or env.num_envs or 1
     if env.suite == "nht":
         return make_env(env.name, copies, env.num_threads, seed=seed, device=device, **env.options)
     if env.suite not in FOREIGN:
@@ -65,11 +62,8 @@ def base_env(
         raise ValueError(
             f"{env.suite} steps its copies in one thread, got env.num_threads={env.num_threads}."
         )
-    return FOREIGN[env.suite](env.name, copies, seed, device, **env.options)
-
-
-TEST_SEED = 1_000_000
-"""Added to a run's seed, so that test episodes are never those of the training."""
+    made: EnvBase = imported(FOREIGN[env.suite])(env.name, copies, seed, device, **env.options)
+    return made
 
 
 def lasting_failures(env: EnvConfig) -> EnvConfig:
@@ -79,37 +73,66 @@ def lasting_failures(env: EnvConfig) -> EnvConfig:
     return replace(env, options=env.options | {"terminate_on_failure": False})
 
 
-def test_env(config: Training, map: nht.ActionMap, episodes: int) -> TransformedEnv:
-    """One copy for each test episode, on seeds of its own; failures do not end episodes, they last."""
-    env = lasting_failures(config.env)
-    scale, seed = config.map.action_scale, config.seed + TEST_SEED
-    return mapped_env(env, map, scale, seed=seed, num_envs=episodes, device=config.device)
+class RunEnvs:
+    """The environments of one of the processes that learn together.
 
-
-def run_map(config: Training, folder: Path) -> nht.ActionMap:
-    """The run's action map, which the run's folder keeps: the given file, else one trained on demonstrations.
-
-    Raw actuation of a given scale needs no demonstrations.
+    Args:
+        config: the run's whole configuration.
+        map: the run's action map.
+        ranks: the processes among which copies are divided.
 
     Raises:
-        ValueError: if the given file is not a readable map, or one of another kind.
+        ValueError: if the copies cannot be divided among processes and workers.
+
+    Attributes:
+        copies: how many copies of the task are this process's.
+        train: the task to train on; of parallel collectors, the copies of one worker.
+        test: the same with one copy for each test episode, on seeds of its own; failures last.
+        seed: of this process's random draws.
     """
-    kept = folder / "map.safetensors"
-    if not kept.exists():
-        if config.map.file is not None:
-            map = load_kind(config.map.file, config.map.kind, config.map.residual)
-        elif (
-            config.map.kind == "none" and config.map.residual is None and config.map.action_scale is not None
-        ):
-            map = raw_actuation(config.env)
-        else:
-            map = train_map(config.map, config.env, config.demos, config.seed).map
-        nht.save_map(map, kept)
-    return nht.load_map(kept, device=config.device)
+
+    def __init__(self, config: Training, map: nht.ActionMap, ranks: Ranks) -> None:
+        self._config, self._map, self._device = config, map, ranks.device
+        self.copies = ranks.share("env.num_envs", config.env.num_envs or 1)
+        self.seed = worker_seed(config.seed, ranks.rank) if ranks.rank else config.seed
+        env = lasting_failures(config.env) if config.algo.lasting_failures else config.env
+        self.make: MakeEnv = partial(
+            mapped_env, env, map, num_envs=self._copies_per_worker(ranks), device=self._device
+        )
+        self.train: TransformedEnv = self.make(seed=self.seed)
+        self.test = self.more_tests(config.evaluation.episodes)
+
+    def _copies_per_worker(self, ranks: Ranks) -> int:
+        workers = self._config.collector.num_workers
+        if self.copies % workers:
+            raise ValueError(
+                f"collector.num_workers={workers} cannot share alike the {self.copies} copies that "
+                f"env.num_envs={self._config.env.num_envs} leaves each of {ranks.size} processes."
+            )
+        return self.copies // workers
+
+    def more_tests(self, episodes: int) -> TransformedEnv:
+        """The task to test on, with one copy for each episode, from the first test seed on."""
+        seed = self._config.seed + TEST_SEED
+        env = lasting_failures(self._config.env)
+        return mapped_env(env, self._map, seed=seed, num_envs=episodes, device=self._device)
+
+    def close(self) -> None:
+        """Release the simulators."""
+        for env in (self.train, self.test):
+            if not env.is_closed:
+                env.close()
 
 
-def raw_actuation(env: EnvConfig) -> nht.Identity:
-    """The motors themselves."""
+def check_env(env: EnvConfig) -> int:
+    """Build one copy of the task and close it again: what is wrong with it shows before anything is written.
+
+    Returns:
+        the number of motors.
+
+    Raises:
+        ImportError, ValueError: as ``base_env``.
+    """
     base = base_env(env, seed=0, num_envs=1)
     base.close()
-    return nht.Identity(base.action_spec.shape[-1])
+    return int(base.action_spec.shape[-1])

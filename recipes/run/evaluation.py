@@ -10,6 +10,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from nht.recipes.run.metrics import FAILURE, RETURN, SUCCESS, tested
+
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -27,9 +29,9 @@ class Evaluation:
     def metrics(self) -> dict[str, float]:
         """Means over the episodes."""
         return {
-            "eval_success": float(self.success.double().mean()),
-            "eval_failure": float(self.failure.double().mean()),
-            "eval_return": float(self.episode_return.mean()),
+            tested(SUCCESS): float(self.success.double().mean()),
+            tested(FAILURE): float(self.failure.double().mean()),
+            tested(RETURN): float(self.episode_return.mean()),
         }
 
 
@@ -57,8 +59,8 @@ def evaluate(
             if on_step is not None:
                 on_step(outcome)
             current = env.maybe_reset(step_mdp(stepped))
-            success = torch.where(running, outcome["success"][..., 0], success)
-            failure |= running & outcome["failure"][..., 0]
+            success = torch.where(running, outcome[SUCCESS][..., 0], success)
+            failure |= running & outcome[FAILURE][..., 0]
             total += running * outcome["reward"][..., 0]
             running &= ~outcome["done"][..., 0]
     return Evaluation(success, failure, total)

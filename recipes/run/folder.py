@@ -1,120 +1,175 @@
-"""The folder of a run: configuration, metrics, checkpoints, videos and W&B files."""
+"""The folder of a run: configuration, map, metrics, checkpoints, videos and W&B files; one process owns it."""
 
 from __future__ import annotations
 
 import csv
-import os
+import json
+import shutil
 import time
-from dataclasses import asdict
-from netrc import NetrcParseError, netrc
+from contextlib import ExitStack
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
 import pandas
-import wandb
+import torch
 import yaml
 from omegaconf import OmegaConf
-from torchrl.record.loggers.wandb import WandbLogger
 
-from nht.recipes.config import DDPG, PPO, RunConfig, Training
-from nht.storage import replacing
+import nht
+from nht.recipes.agents.table import find_algorithm, name_of
+from nht.recipes.maps.interface import run_map
+from nht.recipes.maps.kinds import default_scale, map_context_keys
+from nht.recipes.run.dashboard import Dashboard, open_dashboard
+from nht.recipes.run.environments import check_env
+from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
+from nht.recipes.run.ownership import claimed, owner_of
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.sections import Training
+from nht.storage import format_version, replacing
 
-RECIPES: dict[str, type[Training]] = {"DDPG": DDPG, "PPO": PPO}
-"""What ``config.yaml`` says of the algorithm, under ``recipe``; folders that say nothing hold DDPG."""
+CONFIG_FILE, METRICS_FILE, WHOLE_FILE = "config.yaml", "metrics.csv", "whole.json"
+MAP_FILE, VIDEO_FILE = "map.safetensors", "video.mp4"
+OLDEST_ALGORITHM = "ddpg"
+"""Of folders whose configuration does not say which algorithm it is for."""
 
-LASTING = (
-    "recipe",
-    "env.name",
-    "env.context_keys",
-    "env.num_envs",
-    "env.options",
-    "map.kind",
-    "map.action_dim",
-    "algo.hidden",
-    "algo.activation",
-    "evaluation.episodes",
-    "collector.kind",
-    "collector.num_workers",
+TAKEN = (
+    "algo.total_frames",
+    "evaluation.every",
+    "evaluation.video",
+    "env.num_threads",
+    "device",
+    "torch_threads",
+    "run",
 )
-"""Settings that a checkpoint was made for: resuming cannot change them."""
+"""Settings that a run may go on with others of; all else is what its checkpoints were made for."""
 
 
 class RunFolder:
-    """Where one run writes. ``metrics.csv`` has a row per evaluation; W&B gets the same numbers.
+    """Where one run writes: ``metrics.csv`` has a row per evaluation, W&B gets the same numbers.
+
+    The first of the processes that learn together opens and writes it; the others wait and read.
 
     Args:
-        run: folder, resume and W&B settings.
-        config: the whole configuration of the run, a dataclass, saved as ``config.yaml``.
+        config: the whole configuration of the run, saved as ``config.yaml``.
+        ranks: the processes that learn together.
 
     Raises:
-        FileExistsError: if the folder holds a run already and ``run.resume`` is false.
+        FileExistsError: if the folder holds a run already and ``run.resume`` is false, or another process owns it.
         FileNotFoundError: if ``run.resume`` is true and there is nothing to resume.
-        ValueError: if what is to be resumed is a run of another task, algorithm or network.
+        ValueError: if the run that is to go on has other settings, or the task or map cannot be made as told. Nothing
+            is left behind then.
 
     Attributes:
         path: of the folder.
+        config: the configuration, with what follows from task and map filled in.
         resuming: whether it holds a run already, which is to go on.
+        map: the run's action map; it says what an action means.
     """
 
-    def __init__(self, run: RunConfig, config: Any) -> None:
-        self.path = Path(run.folder)
+    def __init__(self, config: Training, ranks: Ranks) -> None:
+        self.path = Path(config.run.folder)
+        self.config = resolved(config)
+        self.metrics = self.path / METRICS_FILE
+        self.resuming = False
+        self._ranks = ranks
         self._started = time.perf_counter()
-        self.metrics = self.path / "metrics.csv"
-        settings = self.path / "config.yaml"
+        self._open = ExitStack()
+        self._dashboard: Dashboard | None = None
+        if ranks.first:
+            with ExitStack() as undo:
+                self._begin(undo)
+                undo.pop_all()
+        ranks.wait()
+        self.resuming = ranks.any(self.resuming)
+        self.map = kept_map(self.path, read_config(self.path), ranks.device)
+
+    def _begin(self, undo: ExitStack) -> None:
+        fresh = not self.path.exists()
+        self.path.mkdir(parents=True, exist_ok=True)
+        if fresh:
+            undo.callback(shutil.rmtree, self.path, ignore_errors=True)
+        lock = self.path / ".owner"
+        undo.push(self._open)
+        if not self._open.enter_context(claimed(lock)):
+            raise FileExistsError(
+                f"{self.path} is being written by {owner_of(lock)}: wait, or choose another."
+            )
+        self._look()
+        motors = check_env(self.config.env)
+        settings = self.path / CONFIG_FILE
+        if not self.resuming:
+            undo.callback(settings.unlink, missing_ok=True)
+        self._write_config()
+        if not (kept := self.path / MAP_FILE).exists():
+            nht.save_map(run_map(self.config, motors), kept)
+        self._dashboard = open_dashboard(self.path, self.config)
+
+    def _look(self) -> None:
+        """Finds out whether a run is to go on here, and whether it may."""
+        settings, run = self.path / CONFIG_FILE, self.config.run
+        resume = run.resume or ("auto" if self._ranks.restarts else False)  # torchrun starts processes anew
         self.resuming = settings.exists()
-        if run.resume is True and not self.resuming:
+        if resume is True and not self.resuming:
             raise FileNotFoundError(f"{self.path} holds no run to resume.")
-        if run.resume is False and self.resuming:
+        if resume is False and self.resuming:
             raise FileExistsError(
                 f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
             )
-        self.path.mkdir(parents=True, exist_ok=True)
-        described = {"recipe": type(config).__name__, **asdict(config)}
         if self.resuming:
-            self._check_same(yaml.safe_load(settings.read_text()), described)
-        else:
-            with replacing(settings) as scratch:
-                scratch.write_text(yaml.safe_dump(described, sort_keys=False))
-        self._wandb = self._start_wandb(run, config) if run.wandb else None
+            self._check_same(*_read(settings))
 
-    def _check_same(self, saved: dict[str, Any], described: dict[str, Any]) -> None:
-        for name in LASTING:
-            old, new = (_setting(settings, name) for settings in ({"recipe": "DDPG"} | saved, described))
-            if old != new:
-                raise ValueError(
-                    f"{self.path} holds a run with {name}={old}: it cannot go on with {name}={new}."
-                )
+    def _check_same(self, algorithm: str, saved: Training) -> None:
+        now = name_of(type(self.config))
+        if find_algorithm(algorithm).schema is not type(self.config):
+            raise ValueError(f"{self.path} holds a run of {algorithm}: it cannot go on with {now}.")
+        if self.config.env.context_keys is None:
+            self.config.env.context_keys = saved.env.context_keys
+        if not self.config.map.scale_is_set:
+            self.config.map.action_scale = saved.map.action_scale
+        before, after = _flat(asdict(saved)), _flat(asdict(self.config))
+        changed = [name for name in after if before.get(name) != after[name] and not _is_taken(name)]
+        if changed:
+            differences = ", ".join(f"{name}={before.get(name)} (now {after[name]})" for name in changed)
+            raise ValueError(
+                f"{self.path} holds a run with {differences}: these cannot change. Go on with what it has, or choose "
+                "another run.folder."
+            )
 
-    def _start_wandb(self, run: RunConfig, config: Any) -> WandbLogger:
-        os.environ.setdefault("WANDB_SILENT", "true")
-        return WandbLogger(
-            exp_name=self.path.name,
-            save_dir=str(self.path),
-            project=run.wandb_project,
-            offline=not _logged_in(),
-            config=asdict(config),
-            group=run.wandb_group,
-            job_type=run.wandb_job_type,
-        )
+    def _write_config(self) -> None:
+        described = {"recipe": name_of(type(self.config)), **asdict(self.config)}
+        with replacing(self.path / CONFIG_FILE) as scratch:
+            scratch.write_text(yaml.safe_dump(described, sort_keys=False))
+
+    @property
+    def whole(self) -> bool:
+        """Whether the run got to its end, with everything that belongs to it, and has nothing left to do."""
+        try:
+            ended = json.loads((self.path / WHOLE_FILE).read_text())
+            return bool(ended[FRAMES] >= self.config.algo.total_frames)
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
 
     def log(self, frames: int, row: dict[str, float]) -> None:
         """Append a row to ``metrics.csv`` and send it to W&B, against environment steps."""
-        row = {"frames": frames, **row, "seconds": time.perf_counter() - self._started}
+        if not self._ranks.first:
+            return
+        row = {FRAMES: frames, **row, SECONDS: time.perf_counter() - self._started}
         fresh = not self.metrics.exists()
         with self.metrics.open("a", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=list(row))
             if fresh:
                 writer.writeheader()
             writer.writerow(row)
-        if self._wandb is not None:
-            self._wandb.experiment.log(row, step=frames)
+        if self._dashboard is not None:
+            self._dashboard.log(frames, row)
 
     def rewind(self, frames: int) -> None:
         """Drop the rows behind ``frames``, or cut short by a kill: a resumed run writes them again.
 
         Its clock goes on from the last row that stays.
         """
-        if not self.metrics.exists():
+        if not self._ranks.first or not self.metrics.exists():
             return
         with self.metrics.open(newline="") as file:
             rows = list(csv.reader(file))
@@ -122,22 +177,41 @@ class RunFolder:
         if not kept:
             self.metrics.unlink()  # its heading may be cut short, too
             return
-        self._started -= float(kept[-1][rows[0].index("seconds")])
+        self._started -= float(kept[-1][rows[0].index(SECONDS)])
         with replacing(self.metrics) as scratch, scratch.open("w", newline="") as file:
             csv.writer(file).writerows([rows[0], *kept])
 
-    def finish(self) -> None:
-        """Hand video and map to W&B, and say what happened and where the files are."""
-        if self._wandb is not None:
-            if (video := self.path / "video.mp4").exists():
-                self._wandb.experiment.log({"video": wandb.Video(str(video), format="mp4")})
-            artifact = wandb.Artifact(f"map-{self.path.name}", type="action-map")
-            artifact.add_file(str(self.path / "map.safetensors"))
-            self._wandb.experiment.log_artifact(artifact)
-            self._wandb.experiment.finish()
+    def finish(self, frames: int) -> None:
+        """Hand video and map to W&B, note that the run is whole, and show it."""
+        if not self._ranks.first:
+            return
+        if self._dashboard is not None:
+            self._dashboard.finish(self.path / MAP_FILE, self.path / VIDEO_FILE)
+        with replacing(self.path / WHOLE_FILE) as scratch:
+            scratch.write_text(json.dumps({FRAMES: frames}))
+        self.show()
+
+    def show(self) -> None:
+        """Say what happened and where the files are."""
+        if not self._ranks.first:
+            return
         rows = pandas.read_csv(self.metrics)
-        print(rows[["frames", "eval_success", "eval_failure", "eval_return"]].tail(5).to_string(index=False))
-        print(f"\n{self.path}: " + ", ".join(sorted(entry.name for entry in self.path.iterdir())))
+        print(rows[[FRAMES, *TESTED]].tail(5).to_string(index=False))
+        shown = sorted(entry.name for entry in self.path.iterdir() if not entry.name.startswith("."))
+        print(f"\n{self.path}: " + ", ".join(shown))
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self._open.close()
+
+
+def resolved(config: Training) -> Training:
+    """The configuration with what follows from task and kind of map filled in: it stands in the run's files."""
+    env = replace(config.env, context_keys=map_context_keys(config.map, config.env))
+    map = replace(config.map, action_scale=default_scale(config.map))
+    if config.map.file is not None:  # the file says
+        env, map = replace(config.env), replace(config.map)
+    return replace(config, env=env, map=map)
 
 
 def read_config(folder: Path) -> Training:
@@ -145,28 +219,41 @@ def read_config(folder: Path) -> Training:
 
     Raises:
         FileNotFoundError: if the folder holds no run.
+        ValueError: if its configuration cannot be read.
     """
-    settings = folder / "config.yaml"
-    if not settings.exists():
-        raise FileNotFoundError(f"{folder} holds no run: it has no config.yaml.")
+    if not (folder / CONFIG_FILE).exists():
+        raise FileNotFoundError(f"{folder} holds no run: it has no {CONFIG_FILE}.")
+    return _read(folder / CONFIG_FILE)[1]
+
+
+def _read(settings: Path) -> tuple[str, Training]:
+    """The name of the algorithm, and the configuration."""
     saved = yaml.safe_load(settings.read_text())
-    schema = OmegaConf.structured(RECIPES[saved.pop("recipe", "DDPG")])
-    return cast(Training, OmegaConf.to_object(OmegaConf.merge(schema, saved)))
+    algorithm = saved.pop("recipe", OLDEST_ALGORITHM)
+    schema = OmegaConf.structured(find_algorithm(algorithm).schema)
+    return algorithm, cast(Training, OmegaConf.to_object(OmegaConf.merge(schema, saved)))
 
 
-def _setting(settings: dict[str, Any], name: str) -> Any:
-    """The entry at a dotted name; None where there is none."""
-    node: Any = settings
-    for part in name.split("."):
-        node = node.get(part) if isinstance(node, dict) else None
-    return node
+def kept_map(folder: Path, config: Training, device: torch.device | str = "cpu") -> nht.ActionMap:
+    """The action map of a run; of one that an earlier version made, with the scale that its configuration has."""
+    path = folder / MAP_FILE
+    map = nht.load_map(path, device=device)
+    scale = config.map.action_scale
+    if format_version(path) == 1 and config.map.scale_is_set and scale is not None:
+        map.action_scale.fill_(scale)
+    return map
 
 
-def _logged_in() -> bool:
-    """Whether W&B has a key here: from the environment or from its login."""
-    if mode := os.environ.get("WANDB_MODE"):
-        return mode == "online"
-    try:
-        return "WANDB_API_KEY" in os.environ or netrc().authenticators("api.wandb.ai") is not None
-    except (FileNotFoundError, NetrcParseError):
-        return False
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted names; free dictionaries, such as options, stay whole."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict) and not prefix:
+            flat |= _flat(value, f"{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def _is_taken(name: str) -> bool:
+    return any(name == taken or name.startswith(f"{taken}.") for taken in TAKEN)

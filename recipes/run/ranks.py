@@ -18,6 +18,8 @@ class Ranks:
 
     Args:
         device: of the tensors; gloo connects CPUs, nccl GPUs.
+        seed: of this process's torch, alike in all: they make the same networks.
+        threads: that torch may use in each process.
 
     Attributes:
         rank: number of this process, 0 to ``size - 1``, on whatever machine it runs.
@@ -25,8 +27,18 @@ class Ranks:
         device: ``device``, on GPUs the one that belongs to this process.
     """
 
-    def __init__(self, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, device: torch.device | str = "cpu", *, seed: int | None = None, threads: int | None = None
+    ) -> None:
+        if threads is not None:
+            torch.set_num_threads(threads)
+        if seed is not None:
+            torch.manual_seed(seed)
         self.device = torch.device(device)
+        if self.device.type == "cuda" and not torch.cuda.is_available():
+            raise ValueError(
+                f"device={device} needs a GPU that PyTorch can use, and there is none: device=cpu."
+            )
         self.size = int(os.environ.get("WORLD_SIZE", "1"))
         self.rank = int(os.environ.get("RANK", "0")) if self.size > 1 else 0
         if self.size == 1:
@@ -44,6 +56,16 @@ class Ranks:
     def first(self) -> bool:
         """Whether this is the process that writes files, where only one may."""
         return self.rank == 0
+
+    @property
+    def folder(self) -> str:
+        """Where this process keeps what is its own, below a folder of the run; alone, in that folder itself."""
+        return f"rank-{self.rank}" if self.size > 1 else ""
+
+    def part_ways(self, seed: int) -> None:
+        """From here on every process draws its own numbers; the first, or one alone, goes on as it is."""
+        if self.rank:
+            torch.manual_seed(seed)
 
     @property
     def restarts(self) -> int:

@@ -12,6 +12,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data.tensor_specs import ContinuousBox
 
+from nht.recipes.run.metrics import CLIPPED, DIVERGED, FAILURE, SUCCESS, trained
+
 
 @dataclass
 class Counters:
@@ -57,11 +59,11 @@ class TrainingStatistics:
         outcome = steps["next"]
         done, actuation = outcome["done"], outcome["actuation"]
         self._steps += len(steps)
-        self._sums["clipped"] += float(((actuation <= self._low) | (actuation >= self._high)).any(-1).sum())
+        self._sums[CLIPPED] += float(((actuation <= self._low) | (actuation >= self._high)).any(-1).sum())
         self._episodes += int(done.sum())
-        for name in ("success", "failure"):
+        for name in (SUCCESS, FAILURE):
             self._sums[name] += float((outcome[name] & done).sum())
-        self._sums["diverged"] += float(outcome["diverged"].sum())
+        self._sums[DIVERGED] += float(outcome[DIVERGED].sum())
 
     def state_dict(self) -> dict[str, Any]:
         """The sums so far."""
@@ -86,7 +88,7 @@ class TrainingStatistics:
         Raises:
             FloatingPointError: if a loss is no longer finite: the networks are lost.
         """
-        names = ("success", "failure", "diverged", "clipped", *self._losses)
+        names = (SUCCESS, FAILURE, DIVERGED, CLIPPED, *self._losses)
         counts = (self._updates, self._episodes, self._steps)
         own = torch.tensor([*counts, *(float(self._sums[name]) for name in names)], dtype=torch.float64)
         (updates, episodes, steps), values = (part.tolist() for part in add(own).split([3, len(names)]))
@@ -95,10 +97,10 @@ class TrainingStatistics:
             if not math.isfinite(value):
                 raise FloatingPointError(f"{name} is {value}: training diverged. Lower the learning rates.")
         row = {
-            "train_success": sums["success"] / (episodes or math.nan),
-            "train_failure": sums["failure"] / (episodes or math.nan),
-            "diverged": sums["diverged"],  # a count: each one is a failure of map, policy or physics
-            "clipped": sums["clipped"] / (steps or math.nan),  # steps with a motor at its limit
+            trained(SUCCESS): sums[SUCCESS] / (episodes or math.nan),
+            trained(FAILURE): sums[FAILURE] / (episodes or math.nan),
+            DIVERGED: sums[DIVERGED],  # a count: each one is a failure of map, policy or physics
+            CLIPPED: sums[CLIPPED] / (steps or math.nan),  # steps with a motor at its limit
         }
         self._clear()
         return row | {name: sums[name] / (updates or math.nan) for name in self._losses}

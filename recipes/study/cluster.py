@@ -15,7 +15,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from nht.recipes.study.jobs import Outcome, Task
+from nht.recipes.study.jobs import Ending, Job
 
 ANSWER = 15.0
 """Seconds within which a cluster must answer."""
@@ -26,7 +26,7 @@ class Cluster:
 
     Args:
         address: of a cluster, ``host:port`` or ``auto``; None starts Ray here.
-        num_workers: tasks at a time, where Ray is started here; None is one for each core.
+        num_workers: jobs at a time, where Ray is started here; None is one for each core.
 
     Raises:
         ConnectionError: if nothing answers at ``address``.
@@ -51,23 +51,23 @@ class Cluster:
             raise
 
     def run(
-        self, work: Callable[[Task, Path], Outcome | None], tasks: Sequence[Task], folder: Path
-    ) -> Iterator[Task]:
-        """Do ``work(task, folder)`` for all tasks, one core each, and give each back once it is done.
+        self, work: Callable[[Job, Path], Ending | None], jobs: Sequence[Job], folder: Path
+    ) -> Iterator[Job]:
+        """Do ``work(job, folder)`` for all jobs, one core each, and give each back once it is done.
 
-        A task whose worker dies is tried again, three times; then it is recorded as failed.
+        A job whose worker dies is tried again, three times; then it is recorded as failed.
         """
         remote = ray.remote(num_cpus=1, max_retries=3)(work)
-        waiting = {remote.remote(task, folder): task for task in tasks}
+        waiting = {remote.remote(job, folder): job for job in jobs}
         while waiting:
             (ready,), _ = ray.wait(list(waiting), num_returns=1)
-            task = waiting.pop(ready)
+            job = waiting.pop(ready)
             try:
                 ray.get(ready)
             except RayError as error:
                 reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
-                Outcome("failed", reason).write(folder / task.name)
-            yield task
+                Ending("failed", reason).write(folder / job.name)
+            yield job
 
     def close(self) -> None:
         """End the workers of this machine, or leave the cluster."""

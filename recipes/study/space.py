@@ -43,8 +43,10 @@ class Distribution:
         Raises:
             ValueError: for an unknown kind, or values that it cannot have.
         """
-        if len(written) != 1 or next(iter(written)) not in KINDS:
-            raise ValueError(f"search.space.{name} must be one of {list(KINDS)}: [...], got {dict(written)}.")
+        if len(written) != 1 or next(iter(written)) not in DISTRIBUTIONS:
+            raise ValueError(
+                f"search.space.{name} must be one of {list(DISTRIBUTIONS)}: [...], got {dict(written)}."
+            )
         ((kind, values),) = written.items()
         if kind == "choice":
             if not values:
@@ -60,7 +62,11 @@ class Distribution:
 
     def at(self, quantile: float) -> Value:
         """The value that the share ``quantile`` in [0, 1) of all draws lies below."""
-        return KINDS[self.kind](quantile, *self.values) if self.kind != "choice" else self._chosen(quantile)
+        return (
+            DISTRIBUTIONS[self.kind](quantile, *self.values)
+            if self.kind != "choice"
+            else self._chosen(quantile)
+        )
 
     def _chosen(self, quantile: float) -> Value:
         return self.values[int(quantile * len(self.values))]
@@ -82,7 +88,7 @@ def _geometric(quantile: float, low: int, high: int) -> int:
     return round(_exponential(quantile, low, high))
 
 
-KINDS: dict[str, Any] = {
+DISTRIBUTIONS: dict[str, Any] = {
     "uniform": _uniform,
     "integer": _integer,
     "exponential": _exponential,

@@ -1,0 +1,160 @@
+"""DDPG: its settings, its networks, its loss."""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP
+from torchrl.objectives import DDPGLoss
+
+from nht.recipes.agents.norm import RunningNorm
+from nht.recipes.agents.off_policy import HalfPrecisionMLP
+from nht.recipes.agents.returns import UNBOUNDED, Range, return_range, reward_range
+from nht.recipes.agents.table import Algorithm
+from nht.recipes.sections import AlgoConfig, Training
+
+
+@dataclass
+class DDPGConfig(AlgoConfig):
+    """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
+
+    updates_per_batch: int = 20
+    warmup_frames: int = 2_000  # collected before the first update
+    random_frames: int = 0  # the first ones, whose actions are uniform
+    batch_size: int = 256
+    buffer_size: int = 1_000_000
+    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    actor_learning_rate: float = 1e-3
+    critic_learning_rate: float = 1e-3
+    gamma: float = 0.98
+    n_steps: int = (
+        1  # rewards that a target adds up before it trusts the critic, within a batch of the collector
+    )
+    polyak: float = 0.96  # share of the old target network that stays at each move
+    target_update_every: int = 1  # gradient steps between two moves of the target networks
+    action_l2: float = 0.05  # weight of the mean squared action in the actor's loss
+    exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
+    noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
+    random_action: float = 0.1  # probability of a uniform action instead
+    pessimism: float = 0.8  # the critic starts at this times the lowest return that is possible
+    observation_clip: float = 5.0  # of the normalised observation
+    bfloat16: bool = False  # the precision of hidden layers' matrix products; weights stay float32
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a value outside its range."""
+        if not 0 < self.gamma < 1:
+            raise ValueError(f"algo.gamma must lie in (0, 1), got {self.gamma}.")
+        for name in ("polyak", "random_action", "pessimism"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"algo.{name} must lie in [0, 1], got {getattr(self, name)}.")
+        counts = ("total_frames", "frames_per_batch", "n_steps", "batch_size", "buffer_size")
+        for name in (*counts, "target_update_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"algo.{name} must be at least 1, got {getattr(self, name)}.")
+        for name in ("action_l2", "exploration_noise", "updates_per_batch", "warmup_frames", "random_frames"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"algo.{name} must not be negative, got {getattr(self, name)}.")
+        if self.noise_memory < 1:
+            raise ValueError(f"algo.noise_memory must be at least 1 step, got {self.noise_memory}.")
+
+
+@dataclass
+class DDPG(Training):
+    """``python -m nht.recipes.ddpg``."""
+
+    algo: DDPGConfig = field(default_factory=DDPGConfig)
+
+
+def networks(env: EnvBase, algo: DDPGConfig) -> tuple[TensorDictModule, TensorDictModule, TensorDictModule]:
+    """Normaliser, actor and critic for ``env``.
+
+    Returns:
+        the normaliser, ``"observation"`` to ``"features"``; the actor, features to an ``"action"`` in [-1, 1]^k; and
+        the critic, features and action to a ``"state_action_value"`` that starts near ``pessimism`` times
+        the lowest return that is possible, or near 0 where rewards know no bound.
+    """
+    size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+    norm = RunningNorm(size, algo.observation_clip).to(env.device)
+    hidden = {"num_cells": list(algo.hidden), "activation_class": nn.ReLU, "device": env.device}
+    network = HalfPrecisionMLP if algo.bfloat16 else MLP
+    actor = nn.Sequential(network(size, action_dim, **hidden), nn.Tanh())
+    critic = network(size + action_dim, 1, **hidden)
+    lowest, _ = return_range(reward_range(env), algo.gamma)
+    nn.init.constant_(critic[-1].bias, algo.pessimism * lowest if math.isfinite(lowest) else 0.0)
+    return (
+        TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
+        TensorDictModule(actor, in_keys=["features"], out_keys=["action"]),
+        TensorDictModule(critic, in_keys=["features", "action"], out_keys=["state_action_value"]),
+    )
+
+
+class PaperDDPGLoss(DDPGLoss):
+    """``DDPGLoss`` with both target networks, targets clipped if asked for, and an actor that pays for large actions.
+
+    Parameters, targets and their updaters are TorchRL's. The networks are called as they are, where TorchRL puts
+    parameters into one module before every call: that costs a third of an update of networks as small as ours.
+
+    Args:
+        actor_network: ``"features"`` to an ``"action"`` in [-1, 1]^k.
+        value_network: features and action to a ``"state_action_value"``.
+        gamma: discount factor.
+        action_l2: weight of the mean squared action in the actor's loss.
+        reward_range: smallest and largest reward of a step, infinite where unknown; targets are clipped to the
+            returns that these allow.
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        value_network: TensorDictModule,
+        *,
+        gamma: float,
+        action_l2: float,
+        reward_range: Range = UNBOUNDED,
+    ) -> None:
+        super().__init__(actor_network, value_network, delay_actor=True, delay_value=True)
+        self.gamma, self.action_l2 = gamma, action_l2
+        self.returns = return_range(reward_range, gamma)
+        actor, critic = actor_network.module, value_network.module
+        target_actor, target_critic = deepcopy(actor), deepcopy(critic)
+        self.target_actor_network_params["module"].to_module(target_actor)
+        self.target_value_network_params["module"].to_module(target_critic)
+        # Not submodules: whose parameters they share are.
+        self.__dict__["_networks"] = actor, critic, target_actor, target_critic
+
+    def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The critic's loss, a scalar, and the ``"target_value"`` ``(B,)`` of a batch ``(B,)``."""
+        _, critic, target_actor, target_critic = self._networks
+        outcome = tensordict["next"]
+        with torch.no_grad():
+            later = target_critic(outcome["features"], target_actor(outcome["features"]))
+            discount = self.gamma ** tensordict["steps_to_next_obs"].unsqueeze(-1)
+            target = outcome["reward"] + discount * ~outcome["terminated"] * later
+            target.clamp_(*self.returns)
+        error = critic(tensordict["features"], tensordict["action"]) - target
+        return error.square().mean(), {"target_value": target.squeeze(-1)}
+
+    def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The actor's loss, a scalar; its gradient leaves the critic alone."""
+        actor, critic, _, _ = self._networks
+        action = actor(tensordict["features"])
+        critic.requires_grad_(False)
+        value = critic(tensordict["features"], action)
+        critic.requires_grad_(True)
+        return self.action_l2 * action.square().mean() - value.mean(), {}
+
+
+def policy(env: EnvBase, algo: DDPGConfig) -> TensorDictModule:
+    """The policy, untrained: observations to actions, without exploration."""
+    features, actor, _ = networks(env, algo)
+    return TensorDictSequential(features, actor)
+
+
+ALGORITHM = Algorithm(main="nht.recipes.ddpg:main", schema=DDPG, policy=policy)

@@ -1,0 +1,53 @@
+"""Rewards and what they add up to: their bounds, the price of a failure, targets of several steps."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data.postprocs import MultiStep
+from torchrl.envs import EnvBase
+
+Range = tuple[float, float]
+"""Smallest and largest value."""
+UNBOUNDED: Range = (-math.inf, math.inf)
+
+
+def reward_range(env: EnvBase) -> Range:
+    """Smallest and largest reward of a step, as the environment's spec has it; infinite where it knows none."""
+    space = env.reward_spec.space
+    # TorchRL writes "unbounded" as the largest numbers of the type.
+    low, high = float(space.low.min()), float(space.high.max())
+    largest = torch.finfo(env.reward_spec.dtype).max
+    return (low if low > -largest else -math.inf), (high if high < largest else math.inf)
+
+
+def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> Range:
+    """The lowest and the highest discounted return that such rewards can add up to, over no step to ``steps``."""
+    low, high = reward_range
+    most = steps if gamma == 1.0 else (1.0 - gamma**steps) / (1.0 - gamma)
+    return min(low, 0.0) * most, max(high, 0.0) * most
+
+
+def charge_failure(
+    tensordict: TensorDictBase, gamma: float, reward_range: Range, steps: float = math.inf
+) -> TensorDictBase:
+    """Let an episode that failure ended be worth the lowest return, where there is one: failing early never pays."""
+    lowest, _ = return_range(reward_range, gamma, steps)
+    if math.isfinite(lowest):
+        outcome = tensordict["next"]
+        fatal = outcome["failure"] & outcome["terminated"]
+        outcome["reward"] = torch.where(fatal, lowest, outcome["reward"])
+    return tensordict
+
+
+def n_step_returns(gamma: float, steps: int) -> MultiStep:
+    """TorchRL's ``MultiStep``, which turns collected steps ``(copies, T)`` into ones of up to ``steps`` rewards.
+
+    Left as it is, it moves observations ahead but not the flags of their ends, and a target that meets a failure would
+    go on to the critic's value of what it led to.
+    """
+    multi_step = MultiStep(gamma, steps)
+    multi_step.done_keys = ()
+    return multi_step

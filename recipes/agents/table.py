@@ -1,0 +1,76 @@
+"""The table of algorithms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict.nn import TensorDictModule
+from torchrl.envs import EnvBase
+
+from nht.envs.table import Table, imported
+from nht.recipes.sections import Training
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """What the table knows of an algorithm.
+
+    Attributes:
+        main: where its recipe is, ``"module:function"``; it takes a ``schema``.
+        schema: dataclass of all that the recipe can be told, a ``Training`` with an ``algo`` of its own.
+        policy: makes the untrained policy for an environment and ``algo``, without exploration, whose weights a
+            finished run keeps.
+    """
+
+    main: str
+    schema: type[Training]
+    policy: Callable[[EnvBase, Any], TensorDictModule]
+
+    def train(self, config: Training) -> None:
+        """Run the recipe."""
+        imported(self.main)(config)
+
+
+def _adopt(name: str, found: Any) -> Algorithm:
+    if not isinstance(found, Algorithm):
+        raise TypeError(f"the algorithm {name!r} must be an Algorithm, got {found!r}.")
+    return found
+
+
+ALGORITHMS: Table[Algorithm] = Table(
+    "nht.algorithms",
+    {name: f"nht.recipes.agents.{name}:ALGORITHM" for name in ("ddpg", "ppo")},
+    _adopt,
+)
+"""Every algorithm by the name of its recipe; packages add theirs as entry points ``nht.algorithms``."""
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """The record of an algorithm.
+
+    Args:
+        name: a key of ``ALGORITHMS``, or an import path; folders of older runs have it in capitals.
+
+    Raises:
+        ValueError: for an unknown name; the message lists those that exist.
+    """
+    known = name if name in ALGORITHMS else name.lower()
+    if known not in ALGORITHMS:
+        raise ValueError(
+            f"unknown algorithm {name!r}: choose from {sorted(ALGORITHMS)}, or name an import path, "
+            "package.module:ALGORITHM."
+        )
+    try:
+        return ALGORITHMS[known]
+    except (ImportError, TypeError) as error:
+        raise ValueError(f"the algorithm {name!r} cannot be found: {error}") from error
+
+
+def name_of(schema: type[Training]) -> str:
+    """The name under which the algorithm of a schema stands in the table, or its import path."""
+    for name in ALGORITHMS:
+        if ALGORITHMS[name].schema is schema:
+            return name
+    return f"{schema.__module__}:ALGORITHM"

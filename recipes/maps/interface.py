@@ -1,0 +1,160 @@
+"""The interface of a run: a map trained on demonstrations, one from a file, or the motors themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+from tqdm import tqdm
+
+import nht
+from nht.recipes.data.recording import record_expert
+from nht.recipes.maps.kinds import (
+    arm_of,
+    default_scale,
+    find_kind,
+    make_map,
+    map_context_keys,
+    tasks_with_arm,
+)
+from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig, Training
+from nht.storage import format_version
+
+
+def train_map(
+    map: MapConfig,
+    env: EnvConfig,
+    demos: DemosConfig,
+    seed: int,
+    device: str = "cpu",
+    *,
+    align: str | None = None,
+) -> nht.MapTraining:
+    """Train the map that ``map`` describes; without a folder of demonstrations the expert gives them.
+
+    With ``align="tool"`` its axes are then turned to the motion of the arm's tool: 1 is along +x, 2 along +y, 3 along
+    +z, on average over the demonstrations; 4, 5 and 6 turn it about x, y and z.
+
+    Raises:
+        ValueError: for an unknown kind of map, or demonstrations of another task; for an alignment without a known
+            arm, or of a map that is not linear or has more than six axes.
+    """
+    keys = map_context_keys(map, env)
+    with TemporaryDirectory() as scratch:
+        if demos.path is None:
+            data = record_expert(env, demos, seed, Path(scratch) / "demos")
+        else:
+            data = nht.load_demos(demos.path, env=env.name)
+        context_dim = data.context(keys).shape[-1]
+        untrained = make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device)
+        if align is not None:
+            _check_alignable(untrained, env.name)
+        with tqdm(total=map.max_steps, desc=f"map {map.kind}", unit="step", unit_scale=True) as bar:
+
+            def show(metrics: dict[str, float]) -> None:
+                bar.set_postfix(error=f"{metrics['validation_error']:.2e}", refresh=False)
+                bar.update(int(metrics["step"]) - bar.n)
+
+            trained = nht.train_map(
+                data,
+                untrained,
+                context_keys=keys,
+                batch_size=map.batch_size,
+                learning_rate=map.learning_rate,
+                max_steps=map.max_steps,
+                seed=seed,
+                progress=show,
+            )
+        finished = trained.map if align is None else _tool_aligned(trained.map, data, env.name)
+    finished = _configured(finished, map)
+    return nht.MapTraining(finished, trained.metrics | {"action_scale": float(finished.action_scale)})
+
+
+def _check_alignable(map: nht.ActionMap, task: str) -> None:
+    if task not in (arms := tasks_with_arm()):
+        raise ValueError(f"align=tool needs an arm's kinematics: {arms} have one, {task!r} does not.")
+    if not isinstance(map, nht.LinearActionMap) or map.action_dim > 6:
+        raise ValueError(
+            f"align=tool needs a linear map of at most 6 axes, got {type(map).__name__} with {map.action_dim}."
+        )
+
+
+@torch.no_grad()
+def _tool_aligned(map: nht.ActionMap, demos: nht.Demos, task: str) -> nht.ActionMap:
+    assert isinstance(map, nht.LinearActionMap)
+    context, joint_angle, actuation = (
+        value.to(map.action_scale)
+        for value in (demos.context(map.context_keys or ()), demos.data["joint_angle"], demos.actuation)
+    )
+    directions = torch.eye(6, map.action_dim)
+    aligned = nht.align(map, directions, context, jacobian=arm_of(task).jacobian(joint_angle))
+    aligned.action_scale.copy_(aligned.project(actuation, context).abs().max())
+    return aligned
+
+
+def _configured(map: nht.ActionMap, settings: MapConfig) -> nht.ActionMap:
+    """A map with the corrections and the action scale that are asked for: from here on they are its own."""
+    if settings.residual is not None and not isinstance(map, nht.Residual):
+        map = nht.Residual(map, settings.residual)
+    if (scale := default_scale(settings)) is not None:
+        map.action_scale.fill_(scale)
+    return map
+
+
+def load_kind(settings: MapConfig) -> nht.ActionMap:
+    """The map in ``map.file``, which must be of ``map.kind``; with corrections, if asked for, that it may not have.
+
+    What an action means is the file's: ``map.action_scale`` changes it only where it is set. Files of the first
+    format version were used at the kind's own scale, and are.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is of another kind or has other corrections, for a run would carry the wrong name.
+    """
+    path, kind = settings.file or "", find_kind(settings.kind)
+    map = nht.load_map(path)
+    core = map
+    if isinstance(map, nht.Residual):
+        core = map.map
+        if map.scale != settings.residual:
+            raise ValueError(
+                f"{path} holds a map with residual {map.scale}, but map.residual is {settings.residual}."
+            )
+    if isinstance(core, nht.Aligned):
+        core = core.map
+    if type(core) is not kind.map_class:
+        raise ValueError(f"{path} holds a {type(core).__name__}, but map.kind is {settings.kind!r}.")
+    scale = None if settings.scale_is_set or format_version(path) == 1 else float(map.action_scale)
+    map = _configured(map, settings)
+    if scale is not None:
+        map.action_scale.fill_(scale)
+    return map
+
+
+def run_map(settings: Training, motors: int) -> nht.ActionMap:
+    """The map that a run is told to use: the given file's, one trained on demonstrations, or the motors themselves.
+
+    Raw actuation of a given scale needs no demonstrations.
+
+    Args:
+        settings: of the run.
+        motors: n, of the task.
+
+    Raises:
+        FileNotFoundError, ValueError: if the given file holds no map, one of another kind, or one trained on other
+            observations than ``env.context_keys`` names.
+    """
+    map, env = settings.map, settings.env
+    if map.file is not None:
+        loaded = load_kind(map)
+        said = find_kind(map.kind).context_keys or env.context_keys
+        own = loaded.context_keys if loaded.context_dim else None
+        if said is not None and own is not None and list(own) != list(said):
+            raise ValueError(
+                f"the map in {map.file} was trained on the observations {list(own)}, env.context_keys are {list(said)}."
+            )
+        return loaded
+    if map.kind == "none" and map.residual is None and default_scale(map) is not None:
+        return _configured(nht.Identity(motors), map)
+    return train_map(map, env, settings.demos, settings.seed).map

@@ -1,0 +1,175 @@
+"""The loop of training around its updates: batches, checkpoints, signals, and what follows the last step."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.collectors import BaseCollector, Collector
+
+from nht.recipes.agents.policy import save_policy
+from nht.recipes.run.checkpoints import Checkpoints
+from nht.recipes.run.collecting import CollectorState, batch_copies, make_collector
+from nht.recipes.run.environments import RunEnvs
+from nht.recipes.run.folder import VIDEO_FILE, RunFolder
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.record import Record
+from nht.recipes.run.video import record_video
+
+VIDEO_EPISODES = 3
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
+"""What tells a run to end: after a last checkpoint."""
+
+
+class Loop:
+    """Collects the batches of a run, and saves on the way what it goes on from.
+
+    Args:
+        folder: of the run.
+        ranks: the processes that learn together.
+        envs: the run's environments.
+        record: of the run.
+        policy: what acts, exploration included.
+        loss: whose parameters are trained; all processes start with the first one's.
+        random_frames: the first steps of all processes, whose actions are uniform.
+        parts: what else the algorithm goes on from, each with a ``state_dict`` and a ``load_state_dict``.
+
+    Attributes:
+        collector: of this process's batches ``(copies, steps)``.
+    """
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        ranks: Ranks,
+        envs: RunEnvs,
+        record: Record,
+        policy: TensorDictModuleBase,
+        loss: nn.Module,
+        *,
+        random_frames: int = 0,
+        **parts: Any,
+    ) -> None:
+        config = folder.config
+        self._folder, self._ranks, self._envs, self._record = folder, ranks, envs, record
+        self._policy, self._loss = policy, loss
+        self._every = config.run.checkpoint_every
+        self._signal: int | None = None
+        ranks.part_ways(envs.seed)  # the networks are made, alike in all processes; exploration differs
+        self.collector: BaseCollector = make_collector(
+            config.collector,
+            envs.train,
+            envs.make,
+            policy,
+            frames_per_batch=ranks.share("algo.frames_per_batch", config.algo.frames_per_batch),
+            seed=envs.seed,
+            random_frames=random_frames // ranks.size,
+        )
+        self._alone = isinstance(self.collector, Collector)
+        if self._alone:
+            parts["simulator"] = envs.train.base_env.task
+        self._checkpoints = Checkpoints(
+            folder.path / "checkpoints" / ranks.folder,
+            loss=loss,
+            **parts,
+            collector=CollectorState(self.collector, envs.seed),
+            test_simulator=envs.test.base_env.task,
+            counters=record.counters,
+            statistics=record.statistics,
+        )
+
+    @contextmanager
+    def batches(self) -> Iterator[Iterator[TensorDictBase]]:
+        """Begin, or go on where the run stopped; within, SIGTERM and SIGINT end the run after a last checkpoint.
+
+        Returns:
+            the batches ``(copies, steps)`` until all steps are made. When the next one is asked for, workers get the
+            policy as it is, and checkpoints are written now and then.
+
+        Raises:
+            FileNotFoundError: if there is nothing to go on from.
+            ValueError: if the run was made by another number of processes.
+            OSError: if there is no room for a checkpoint; earlier ones stay as they are.
+            SystemExit: after the last checkpoint, if the process was told to end.
+        """
+        before: dict[int, Any] = {}
+        try:
+            if self._folder.resuming:
+                self._go_on()
+            self._ranks.broadcast(self._loss)
+            if threading.current_thread() is threading.main_thread():  # elsewhere Python knows no signals
+                before = {number: signal.signal(number, self._stop) for number in SIGNALS}
+            self._record.show_progress()
+            yield self._batches()
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+            self.collector.shutdown()
+            self._envs.close()
+            self._record.close()
+
+    def _go_on(self) -> None:
+        """Load the newest checkpoint that all processes have."""
+        folder, ranks = self._folder, self._ranks
+        made_by = len(list((folder.path / "checkpoints").glob("rank-*"))) or 1
+        if made_by != ranks.size and (folder.path / "checkpoints").exists():
+            raise ValueError(
+                f"{folder.path} holds the checkpoints of {made_by} processes: {ranks.size} cannot go on from them."
+            )
+        common = set.intersection(*map(set, ranks.gather(self._checkpoints.steps())))
+        if common:
+            self._checkpoints.load(max(common))
+        elif folder.config.run.resume is True:
+            raise FileNotFoundError(f"{folder.path} holds no checkpoint to resume from.")
+        folder.rewind(self._record.frames)
+
+    def _stop(self, number: int, _: Any) -> None:
+        self._signal = number
+        signal.signal(number, signal.SIG_DFL)  # the second one acts at once
+
+    def _batches(self) -> Iterator[TensorDictBase]:
+        batches = iter(self.collector)
+        while not self._record.finished:
+            yield next(batches)
+            if not self._alone:
+                self.collector.update_policy_weights_(self._policy)
+            self._save_if_due()
+
+    def _save_if_due(self) -> None:
+        stopping = self._ranks.any(self._signal is not None)
+        if stopping or self._record.frames % self._every == 0:
+            self._checkpoints.save(self._record.frames)
+        if stopping and not self._record.finished:
+            self._record.close()
+            if self._ranks.first:
+                print(f"{self._folder.path} was told to end: go on with run.resume=true.")
+            sys.exit(128 + (self._signal or signal.SIGTERM))
+
+    @property
+    def batch_copies(self) -> slice:
+        """Which of this process's copies made the latest batch."""
+        return batch_copies(self.collector, self._envs.train.batch_size.numel())
+
+    def finish(self, policy: TensorDictModuleBase) -> None:
+        """Save and film the policy, close everything, and say what happened."""
+        folder, config = self._folder, self._folder.config
+        if self._ranks.first:
+            save_policy(policy, folder.path)
+            if config.evaluation.video:
+                self._film(policy)
+        folder.finish(self._record.frames)
+        folder.close()
+        self._ranks.part()
+
+    def _film(self, policy: TensorDictModuleBase) -> None:
+        try:
+            record_video(self._envs.more_tests(VIDEO_EPISODES), policy, self._folder.path / VIDEO_FILE)
+        except RuntimeError as error:  # a machine without OpenGL trains all the same
+            print(f"no video: {error}")

@@ -1,0 +1,35 @@
+"""The columns of ``metrics.csv``: their names are spelled here and nowhere else."""
+
+from __future__ import annotations
+
+FRAMES, UPDATES, SECONDS = "frames", "updates", "seconds"
+SUCCESS, FAILURE, RETURN = "success", "failure", "return"
+OUTCOMES = (SUCCESS, FAILURE, RETURN)
+"""What an episode is judged by."""
+DIVERGED, CLIPPED = "diverged", "clipped"
+
+
+def tested(outcome: str) -> str:
+    """The column of an outcome's mean over the test episodes."""
+    return f"eval_{outcome}"
+
+
+def trained(outcome: str) -> str:
+    """The column of an outcome's mean over the episodes of training that ended since the last row."""
+    return f"train_{outcome}"
+
+
+TESTED = tuple(map(tested, OUTCOMES))
+EVERY_RUN = (FRAMES, *TESTED, SECONDS)
+"""Columns that every run has, whatever the algorithm."""
+
+
+def check_outcome(name: str, given: str) -> None:
+    """Raise ValueError unless an outcome is one that runs are compared by.
+
+    Args:
+        name: of the setting.
+        given: its value.
+    """
+    if given not in (SUCCESS, RETURN):
+        raise ValueError(f"{name} must be {SUCCESS} or {RETURN}, got {given!r}.")

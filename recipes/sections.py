@@ -1,0 +1,201 @@
+"""The sections that configurations are made of: one dataclass each, checked before anything runs.
+
+The YAML files under ``configs/`` hold what differs between choices; a key that is not a field here is an error.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+DEFAULT_SCALE = "default"
+"""Of ``map.action_scale``: what the kind of map says."""
+
+
+def path_field(default: str | None) -> Any:
+    """A field that holds a path: on the command line it may hold any character, and ``~`` is the user's home."""
+    return field(default=default, metadata={"path": True})
+
+
+@dataclass
+class EnvConfig:
+    """Which task, and how many copies of it."""
+
+    name: str = "wam_wipe"  # of the table of tasks, or where it is: my_package.tasks:Pour
+    suite: str = "nht"  # whose task it is: nht, dm_control, gymnasium or torchrl
+    context_keys: list[str] | None = None  # what a map sees, in order; None is what the task says
+    num_envs: int | None = None  # copies; None is what the algorithm says
+    num_threads: int = 1
+    options: dict[str, Any] = field(default_factory=dict)  # of the task itself, in training and in evaluation
+
+
+@dataclass
+class DemosConfig:
+    """Where demonstrations come from: a folder, or else the task's scripted expert."""
+
+    path: str | None = path_field(None)
+    transitions: int = 20_000
+    speed: float | None = None  # of the expert's tool [m/s]; None is its default
+    max_episode_steps: int = 1_000  # a demonstration ends at success, long before
+    min_return: float | None = None  # of an episode worth keeping
+
+
+@dataclass
+class SourceConfig:
+    """What ``collect_demos`` makes demonstrations from. Keys may be nested: ``info/goal``."""
+
+    kind: str = "expert"  # expert, policy, minari, hdf5 or tensordict
+    path: str | None = path_field(None)  # run folder; Minari id, folder or file; HDF5 file; TensorDict folder
+    env: str | None = None  # the task's name there, where it is not ours
+    context: dict[str, str] = field(default_factory=dict)  # {our name: its key there}; none: observations
+    actuation_key: str | None = None  # hdf5, tensordict: None is "actions" and "action"
+    episode_key: str | None = None  # hdf5, tensordict: integers that differ between episodes
+    done_key: str | None = None  # hdf5, tensordict: true at an episode's last step; None takes the usual ones
+
+
+@dataclass
+class MapConfig:
+    """Which action map, and how it is trained."""
+
+    kind: str = "nht"  # of the table of kinds, or where it is: my_package.maps:TwoSided
+    file: str | None = path_field(None)  # a saved map; None trains one from the demonstrations
+    allow: list[str] = field(default_factory=list)  # packages whose classes a map file may name
+    args: dict[str, Any] = field(default_factory=dict)  # further arguments of the kind's own
+    action_dim: int = 2
+    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    activation: str = "tanh"
+    multi_head: bool = False  # nht: each reflection has a last hidden layer of its own
+    lipschitz: float | None = None  # bound L on the whole map; None leaves it free
+    lipschitz_per_layer: bool = False  # L bounds each layer instead, if there is a bound
+    learning_rate: float = 1e-3
+    batch_size: int = 256
+    max_steps: int = 6_000
+    beta_kl: float = 1e-3  # laser: weight of the KL divergence of its latents
+    beta_dynamics: float = 1e-3  # laser: weight of predicting the next context
+    residual: float | None = None  # adds n corrections to the action, each worth this much actuation
+    # What an action of 1 is worth: a number, null for the demonstrations' largest action, or what the kind says.
+    action_scale: Any = DEFAULT_SCALE
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for corrections without a positive size, or an action scale that is none."""
+        if self.residual is not None and not self.residual > 0:
+            raise ValueError(
+                f"map.residual must be positive, or null for no corrections, got {self.residual}."
+            )
+        scale = self.action_scale
+        if scale is None or scale == DEFAULT_SCALE:
+            return
+        if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < math.inf:
+            raise ValueError(
+                "map.action_scale must be a positive, finite number, null for the demonstrations' largest action, or "
+                f"{DEFAULT_SCALE!r}, got {scale!r}."
+            )
+
+    @property
+    def scale_is_set(self) -> bool:
+        """Whether ``action_scale`` was said, null included."""
+        return self.action_scale != DEFAULT_SCALE
+
+
+@dataclass
+class AlgoConfig:
+    """What every algorithm has: how many environment steps, and how many of them between two rounds of updates."""
+
+    total_frames: int = 100_000
+    frames_per_batch: int = 200
+    num_envs: int = 10  # copies of the task that the settings were found with
+    lasting_failures: bool = False  # a failure does not end an episode of training: it lasts
+
+
+@dataclass
+class CollectorConfig:
+    """Which processes step the copies."""
+
+    kind: str = "single"  # this one; or multi_sync, multi_async: workers beside it
+    num_workers: int = 1  # of each learner, which share its copies
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an unknown kind, or a number of workers that does not go with it."""
+        if self.kind not in ("single", "multi_sync", "multi_async"):
+            raise ValueError(f"collector.kind must be single, multi_sync or multi_async, got {self.kind!r}.")
+        if self.num_workers < 1:
+            raise ValueError(f"collector.num_workers must be at least 1, got {self.num_workers}.")
+        if self.kind == "single" and self.num_workers != 1:
+            raise ValueError(
+                f"collector=single has no workers, got collector.num_workers={self.num_workers}: "
+                "choose collector=multi_sync or multi_async."
+            )
+
+
+@dataclass
+class EvaluationConfig:
+    """Deterministic episodes on environments and seeds of their own."""
+
+    every: int = 10_000  # frames between two evaluations
+    episodes: int = 100
+    video: bool = True  # of the final policy
+
+
+@dataclass
+class RunConfig:
+    """Where a run writes, and whether it goes on from what it finds there."""
+
+    folder: str = path_field("")
+    resume: Any = False  # true, or auto: go on if the folder holds a run, else begin
+    checkpoint_every: int = 50_000  # frames
+    wandb: bool = True
+    wandb_project: str = "nht"
+    wandb_group: str | None = None
+    wandb_job_type: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for another way to resume."""
+        if self.resume not in (True, False, "auto"):
+            raise ValueError(f"run.resume must be true, false or auto, got {self.resume!r}.")
+
+
+@dataclass
+class Training:
+    """A run of an algorithm on a task, through an action map."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    algo: AlgoConfig = field(default_factory=AlgoConfig)
+    collector: CollectorConfig = field(default_factory=CollectorConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+    seed: int = 0
+    device: str = "cpu"
+    torch_threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for settings that do not go together."""
+        if self.env.num_envs is None:
+            self.env.num_envs = self.algo.num_envs
+        frames = {
+            "algo.total_frames": self.algo.total_frames,
+            "evaluation.every": self.evaluation.every,
+            "run.checkpoint_every": self.run.checkpoint_every,
+        }
+        for name, value in frames.items():
+            if value < self.algo.frames_per_batch or value % self.algo.frames_per_batch:
+                raise ValueError(
+                    f"{name} must be a multiple of algo.frames_per_batch={self.algo.frames_per_batch}, got {value}."
+                )
+        if self.evaluation.every > self.algo.total_frames:
+            raise ValueError(
+                f"evaluation.every={self.evaluation.every} must be at most algo.total_frames="
+                f"{self.algo.total_frames}: a run without an evaluation has nothing to show."
+            )
+        if self.env.num_envs % self.collector.num_workers:
+            raise ValueError(
+                f"env.num_envs={self.env.num_envs} must be a multiple of "
+                f"collector.num_workers={self.collector.num_workers}: every worker steps as many copies."
+            )
+        if self.algo.frames_per_batch % self.env.num_envs:
+            raise ValueError(
+                f"algo.frames_per_batch={self.algo.frames_per_batch} must be a multiple of "
+                f"env.num_envs={self.env.num_envs}: every copy makes the same number of steps."
+            )
