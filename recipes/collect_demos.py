@@ -9,6 +9,7 @@ python -m nht.recipes.collect_demos source=minari source.path=D4RL/door/human-v2
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -47,14 +48,19 @@ def _collect(config: CollectDemos) -> nht.Demos:
     if source.kind == "expert":
         return record_expert(config.env, config.demos, config.seed, config.out)
     if source.kind == "policy":
-        return record_policy(source.path, config.env, config.demos, config.seed, config.out)
+        return record_policy(source.path, config.env, config.demos, config.seed, config.out, source.allow)
     if source.kind in FILES:
         return import_demos(source, config.env, config.demos.min_return, config.out)
     raise ValueError(f"unknown source.kind {source.kind!r}: choose from {['expert', 'policy', *FILES]}.")
 
 
 def record_policy(
-    run: str | None, env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path
+    run: str | None,
+    env: EnvConfig,
+    demos: DemosConfig,
+    seed: int,
+    path: str | Path,
+    allow: Sequence[str] = (),
 ) -> nht.Demos:
     """Demonstrations of a finished run's policy, without exploration: what the motors got, through the run's map.
 
@@ -68,7 +74,7 @@ def record_policy(
     if run is None:
         raise ValueError("source=policy needs source.path: the folder of a finished run.")
     folder = Path(run)
-    trained = read_config(folder)
+    trained = read_config(folder, allow)
     if trained.env.name != env.name:
         raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
     options = trained.env.options | endings(env.name)
