@@ -6,6 +6,7 @@ python -m nht.recipes.report runs/search-wam_wipe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -50,7 +51,7 @@ def report_runs(config: Report) -> None:
         raise ValueError("name a folder of runs or of a search: report DIR, or report runs=[DIR, DIR].")
     out = Path(config.out or Path(folders[0]) / "report")
     out.mkdir(parents=True, exist_ok=True)
-    curves = read_runs([Path(folder) for folder in folders])
+    curves = read_runs([Path(folder) for folder in folders], config.allow)
     curves.to_csv(out / "curves.csv", index=False)
     table = summarise(curves, config.metric)
     (out / "table.md").write_text(to_markdown(table))

@@ -141,11 +141,9 @@ class RunFolder:
         before, after = _flat(asdict(saved)), _flat(asdict(self.config))
         changed = [name for name in after if before.get(name) != after[name] and not _is_taken(name)]
         if changed:
-            differences = ", ".join(f"{name}={before.get(name)} (now {after[name]})" for name in changed)
-            raise ValueError(
-                f"{self.path} holds a run with {differences}: these cannot change. Go on with what it has, or choose "
-                "another run.folder."
-            )
+            old = ", ".join(f"{name}={before.get(name)}" for name in changed)
+            new = ", ".join(f"{name}={after[name]}" for name in changed)
+            raise ValueError(f"{self.path} holds a run with {old}: it cannot go on with {new}.")
 
     def _write_config(self) -> None:
         described = {"recipe": name_of(type(self.config)), **asdict(self.config)}

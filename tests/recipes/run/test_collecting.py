@@ -9,11 +9,12 @@ import torch
 
 import nht.recipes.ppo
 import tiny_runs
-from nht.recipes.agents.losses import estimate_advantages
-from nht.recipes.config import DDPG, CollectorConfig
+from nht.recipes.agents.ppo import estimate_advantages
+from nht.recipes.config import DDPG
 from nht.recipes.launch import configure
 from nht.recipes.run.collecting import worker_seed
-from nht.recipes.run.training import TrainingRun
+from nht.recipes.run.record import Record
+from nht.recipes.sections import CollectorConfig
 
 SETTINGS = ["algo.total_frames=400", "evaluation.every=400"]
 
@@ -31,9 +32,9 @@ def assert_nothing_runs():
 @pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
 def test_workers_make_exactly_as_many_steps(algorithm, kind, tmp_path, monkeypatch):
     batches = []
-    count = TrainingRun.count_steps
+    count = Record.count_steps
     monkeypatch.setattr(
-        TrainingRun, "count_steps", lambda run, data: (batches.append(data.clone()), count(run, data))
+        Record, "count_steps", lambda run, data: (batches.append(data.clone()), count(run, data))
     )
     metrics = train(algorithm, kind, tmp_path / "run")
     assert metrics["frames"].tolist() == [400]
@@ -81,7 +82,7 @@ def test_no_worker_outlives_an_error(kind, error, tmp_path, monkeypatch):
         workers.extend(multiprocessing.active_children())
         raise error
 
-    monkeypatch.setattr(TrainingRun, "count_steps", fail)
+    monkeypatch.setattr(Record, "count_steps", fail)
     with pytest.raises(error):
         train("ddpg", kind, tmp_path / "run")
     assert len(workers) >= 2

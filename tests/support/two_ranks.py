@@ -10,8 +10,10 @@ from torch import nn
 from torchrl.modules import MLP
 
 from nht.recipes import ddpg, ppo
-from nht.recipes.agents.losses import GaussianPPOLoss, JointSoftUpdate, PaperDDPGLoss
-from nht.recipes.agents.networks import GaussianActor, ReturnNorm, RunningNorm
+from nht.recipes.agents.ddpg import PaperDDPGLoss
+from nht.recipes.agents.norm import ReturnNorm, RunningNorm
+from nht.recipes.agents.off_policy import JointSoftUpdate
+from nht.recipes.agents.ppo import GaussianActor, GaussianPPOLoss
 from nht.recipes.run.ranks import Ranks
 
 OBSERVATION, ACTION, BATCH, UPDATES = 5, 2, 64, 10

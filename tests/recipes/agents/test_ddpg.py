@@ -11,16 +11,10 @@ from torch import nn
 from torchrl.objectives import DDPGLoss, SoftUpdate, ValueEstimators
 
 from nht.envs import make_env
-from nht.recipes.agents.losses import (
-    JointSoftUpdate,
-    PaperDDPGLoss,
-    charge_failure,
-    n_step_returns,
-    return_range,
-    reward_range,
-)
-from nht.recipes.agents.networks import RunningNorm, ddpg_networks
-from nht.recipes.config import DDPGConfig
+from nht.recipes.agents.ddpg import DDPGConfig, PaperDDPGLoss, networks
+from nht.recipes.agents.norm import RunningNorm
+from nht.recipes.agents.off_policy import JointSoftUpdate
+from nht.recipes.agents.returns import charge_failure, n_step_returns, return_range, reward_range
 
 GAMMA = 0.9
 
@@ -91,7 +85,7 @@ def test_actor_pays_for_large_actions_and_leaves_the_critic_alone():
 def test_ddpg_loss_is_torchrls():
     torch.manual_seed(0)
     env = make_env("half_cheetah")
-    _, actor, critic = ddpg_networks(env, DDPGConfig(hidden=[32, 16]))
+    _, actor, critic = networks(env, DDPGConfig(hidden=[32, 16]))
     settings = {"delay_actor": True, "delay_value": True}
     ours = PaperDDPGLoss(actor, critic, gamma=GAMMA, action_l2=0.0, reward_range=(-math.inf, math.inf))
     theirs = DDPGLoss(deepcopy(actor), deepcopy(critic), **settings)
@@ -130,7 +124,7 @@ def test_failure_that_ends_an_episode_costs_minus_one_for_ever():
         },
         batch_size=[4],
     )
-    charged = charge_failure(steps, GAMMA)["next", "reward"].squeeze(-1)
+    charged = charge_failure(steps, GAMMA, (-1.0, 0.0))["next", "reward"].squeeze(-1)
     assert return_range((-1.0, 0.0), GAMMA) == pytest.approx((-10.0, 0.0))
     assert return_range((-1.0, 0.0), GAMMA, steps=2) == pytest.approx((-1.9, 0.0))
     assert return_range((-1.0, 2.0), 1.0, steps=200) == (-200.0, 400.0)
@@ -146,7 +140,7 @@ def test_targets_look_ahead_to_the_end_of_an_episode_and_no_further():
     outcome |= {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
     collected = TensorDict({"features": time, "action": torch.zeros(2, 5, 1), "next": outcome}, [2, 5])
 
-    ahead = n_step_returns(GAMMA, 2)(charge_failure(collected, GAMMA))
+    ahead = n_step_returns(GAMMA, 2)(charge_failure(collected, GAMMA, (-1.0, 0.0)))
 
     assert ahead["steps_to_next_obs"].tolist() == [[2, 2, 1, 2, 1]] * 2  # a batch is an end, too
     assert ahead["next", "features"].squeeze(-1).tolist() == [[2.0, 3.0, 3.0, 5.0, 5.0]] * 2

@@ -15,9 +15,10 @@ import nht
 from nht.envs import make_env
 from nht.envs.wam_kinematics import forward_kinematics
 from nht.maps import ActionMap, LinearActionMap
-from nht.recipes.config import DemosConfig, EnvConfig, MapConfig, TrainMap
+from nht.recipes.config import TrainMap
 from nht.recipes.data.recording import record_expert
-from nht.recipes.train_map import load_kind, train_map
+from nht.recipes.maps.interface import load_kind, train_map
+from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.train import projection_error
 from nht.transforms import ActionMapTransform
 

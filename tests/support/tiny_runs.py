@@ -2,11 +2,10 @@
 
 import pandas
 
-from nht.recipes import ddpg, ppo
-from nht.recipes.config import DDPG, PPO
+from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 
-RECIPES = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}
+RECIPES = ("ddpg", "ppo")
 SHARED = [
     "env=wam_wipe",
     "map=none",
@@ -31,6 +30,6 @@ def settings(algorithm, folder, *overrides):
 
 def train(algorithm, folder, *overrides):
     """Train, and give the metrics without what differs from time to time."""
-    main, schema = RECIPES[algorithm]
-    main(configure(schema, algorithm, settings(algorithm, folder, *overrides)))
+    found = find_algorithm(algorithm)
+    found.train(configure(found.schema, algorithm, settings(algorithm, folder, *overrides)))
     return pandas.read_csv(folder / "metrics.csv").drop(columns="seconds")

@@ -1,10 +1,8 @@
 """Runs of a search: claimed once, recorded however they end, and gone on with."""
 
-import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,12 +11,12 @@ from types import SimpleNamespace
 import pandas
 import pytest
 
-from nht.recipes import cluster as cluster_module
 from nht.recipes import search
+from nht.recipes.agents.table import Algorithm
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure
-from nht.recipes.study import jobs as search_tasks
-from nht.recipes.study.jobs import Outcome, Task, claimed, rows_of, run_task
+from nht.recipes.study import cluster as cluster_module
+from nht.recipes.study.jobs import Ending, Job, rows_of, run_job
 
 BASE = [
     "evaluation.every=200",
@@ -47,11 +45,11 @@ class InProcess:
     def __init__(self, *_):
         self.done = []
 
-    def run(self, work, tasks, folder):
-        for task in tasks:
-            work(task, folder)
-            self.done.append(task.name)
-            yield task
+    def run(self, work, jobs, folder):
+        for job in jobs:
+            work(job, folder)
+            self.done.append(job.name)
+            yield job
 
     def close(self):
         pass
@@ -69,16 +67,15 @@ def recipe(monkeypatch):
     """A recipe that notes what it is told, and does as ``recipe.act`` says."""
     told = SimpleNamespace(configs=[], act=lambda config: None)
 
-    def main(config):
+    def train(_, config):
         told.configs.append(config)
         told.act(config)
 
-    _, schema = search_tasks.RECIPES["ddpg"]
-    monkeypatch.setitem(search_tasks.RECIPES, "ddpg", (main, schema))
+    monkeypatch.setattr(Algorithm, "train", train)
     return told
 
 
-def task(number=0, **changes):
+def job(number=0, **changes):
     entries = {
         "stage": "search",
         "env": "wam_wipe",
@@ -90,7 +87,7 @@ def task(number=0, **changes):
         "parameters": {"algo.gamma": 0.95},
         "overrides": ("map=none", "algo.gamma=0.95"),
     }
-    return Task(**entries | changes)
+    return Job(**entries | changes)
 
 
 def run_search(folder, *overrides):
@@ -160,9 +157,9 @@ def test_failures_are_recorded_and_do_not_stop_the_others(cluster, recipe, tmp_p
 
 def test_a_run_is_what_a_person_would_type(recipe, tmp_path):
     config = configure(Search, "search", ["search=wam", "search.base=['algo=ddpg']"]).search
-    nht, raw = (search.make_task(config, "demos", "search", name, 3, 1, 200_000) for name in ("nht", "raw"))
+    nht, raw = (search.make_job(config, "demos", "search", name, 3, 1, 200_000) for name in ("nht", "raw"))
     for one in (nht, raw):
-        assert run_task(one, tmp_path) == Outcome("done")
+        assert run_job(one, tmp_path) == Ending("done")
     learned, plain = recipe.configs
     assert (learned.map.kind, plain.map.kind) == ("nht", "none")
     layers, units = nht.parameters["map.hidden_layers"], nht.parameters["map.hidden_units"]
@@ -182,52 +179,19 @@ def test_an_interrupted_run_has_not_ended(recipe, tmp_path):
 
     recipe.act = interrupt
     with pytest.raises(KeyboardInterrupt):
-        run_task(task(), tmp_path)
-    assert Outcome.read(tmp_path / task().name) is None
+        run_job(job(), tmp_path)
+    assert Ending.read(tmp_path / job().name) is None
     recipe.act = lambda config: None
-    assert run_task(task(), tmp_path) == Outcome("done")
-    assert rows_of(task(), tmp_path)[["status", "algo.gamma"]].to_numpy().tolist() == [["done", 0.95]]
+    assert run_job(job(), tmp_path) == Ending("done")
+    assert rows_of(job(), tmp_path)[["status", "algo.gamma"]].to_numpy().tolist() == [["done", 0.95]]
 
 
 def test_nobody_runs_what_another_one_is_at(recipe, tmp_path):
-    recipe.act = lambda config: outcomes.append(run_task(task(), tmp_path))
+    recipe.act = lambda config: outcomes.append(run_job(job(), tmp_path))
     outcomes = []
-    assert run_task(task(), tmp_path) == Outcome("done")
+    assert run_job(job(), tmp_path) == Ending("done")
     assert outcomes == [None]
     assert len(recipe.configs) == 1
-
-
-def test_a_claim_falls_with_its_owner(tmp_path):
-    file = tmp_path / "claims" / "run"
-    with claimed(file) as ours, claimed(file) as again:
-        assert ours
-        assert not again
-    assert not file.exists()
-    dead = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
-    )
-    file.write_text(json.dumps({"host": socket.gethostname(), "pid": int(dead.stdout)}))
-    with claimed(file) as ours:
-        assert ours
-    elsewhere = json.dumps({"host": "elsewhere", "pid": 1})
-    file.write_text(elsewhere)
-    with claimed(file) as ours:
-        assert not ours  # it may well live there
-    long_ago = time.time() - 2 * search_tasks.SILENCE
-    os.utime(file, (long_ago, long_ago))
-    with claimed(file) as ours:
-        assert ours
-
-
-def test_a_claim_shows_that_it_lives(tmp_path, monkeypatch):
-    monkeypatch.setattr(search_tasks, "HEARTBEAT", 0.01)
-    file = tmp_path / "run"
-    with claimed(file):
-        os.utime(file, (0, 0))
-        until = time.monotonic() + 10
-        while file.stat().st_mtime == 0 and time.monotonic() < until:
-            time.sleep(0.01)
-        assert file.stat().st_mtime > 0
 
 
 @pytest.mark.parametrize(
@@ -235,7 +199,7 @@ def test_a_claim_shows_that_it_lives(tmp_path, monkeypatch):
     [
         (
             "search.interfaces=[nht,pca]",
-            r"unknown search\.interfaces \['pca'\]: choose from \['raw', 'cae', ",
+            r"unknown search\.interfaces 'pca': choose from \['raw', 'nht', ",
         ),
         ("search.interfaces=[]", r"search\.interfaces is empty"),
         ("search.base=['algo.gama=0.9']", r"gama"),
@@ -268,7 +232,7 @@ def test_the_jacobian_needs_an_arm():
         ("seeds", -1, r"search\.seeds must be at least 1, got -1"),
         ("best_seeds", -1, r"search\.best_seeds must not be negative"),
         ("metric", "loss", r"search\.metric must be success or return, got 'loss'"),
-        ("recipe", "sac", r"search\.recipe must be ddpg or ppo, got 'sac'"),
+        ("recipe", "reinforce", r"unknown algorithm 'reinforce': choose from \['ddpg', 'ppo'"),
     ],
 )
 def test_settings_out_of_range(field, value, message):
@@ -311,29 +275,29 @@ def test_a_worker_that_dies_is_replaced(tmp_path):
     """The worker is killed once its first checkpoint is there; another one goes on from it."""
     folder = tmp_path / "search"
     config = configure(Search, "search", [*SMOKE, "search.interfaces=[raw]", "search.total_frames=4000"])
-    (run,) = search.search_tasks(config.search, tmp_path)
+    (run,) = search.search_jobs(config.search, tmp_path)
     cluster = cluster_module.Cluster(num_workers=1)
     try:
         finished = cluster.run(killed_once, [run], folder)
         assert [one.name for one in finished] == [run.name]
     finally:
         cluster.close()
-    assert Outcome.read(folder / run.name) == Outcome("done")
+    assert Ending.read(folder / run.name) == Ending("done")
     assert len((folder / "deaths").read_text()) == 1
     assert rows_of(run, folder)["frames"].tolist() == list(range(200, 4001, 200))
 
 
 def killed_once(run, folder):
     """Train, and the first time be killed after 1,000 steps."""
-    from nht.recipes.run.training import TrainingRun
+    from nht.recipes.run.record import Record
 
-    count, deaths = TrainingRun.count_steps, folder / "deaths"
+    count, deaths = Record.count_steps, folder / "deaths"
 
     def die(self, data):
         count(self, data)
-        if self.counters.frames == 1_000 and not deaths.exists():
+        if self.frames == 1_000 and not deaths.exists():
             deaths.write_text("x")
             os.kill(os.getpid(), signal.SIGKILL)
 
-    TrainingRun.count_steps = die
-    return run_task(run, folder)
+    Record.count_steps = die
+    return run_job(run, folder)

@@ -19,9 +19,14 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from nht.envs import make_env
-from nht.recipes.agents.losses import GaussianPPOLoss, estimate_advantages
-from nht.recipes.agents.networks import GaussianActor, ReturnNorm, ppo_networks
-from nht.recipes.config import PPOConfig
+from nht.recipes.agents.norm import ReturnNorm
+from nht.recipes.agents.ppo import (
+    GaussianActor,
+    GaussianPPOLoss,
+    PPOConfig,
+    estimate_advantages,
+    networks,
+)
 
 GAMMA, LAMBDA = 0.9, 0.8
 
@@ -154,7 +159,7 @@ def test_advantages_at_the_end_of_an_episode(terminates):
 
 def test_what_is_collected_at_a_time_limit_is_the_episodes_own_last_observation():
     env = make_env("wam_wipe", 2, start="random", max_episode_steps=3)
-    features, actor, critic = ppo_networks(env, PPOConfig(hidden=[8]))
+    features, actor, critic = networks(env, PPOConfig(hidden=[8]))
     policy = TensorDictSequential(features, actor)
     collector = Collector(
         env,
@@ -203,7 +208,7 @@ def test_rewards_are_divided_by_the_deviation_of_all_discounted_returns():
 
 def test_weights_start_orthogonal():
     env = make_env("wam_wipe")
-    _, actor, critic = ppo_networks(env, PPOConfig(hidden=[8, 8], activation="relu", initial_std=0.5))
+    _, actor, critic = networks(env, PPOConfig(hidden=[8, 8], activation="relu", initial_std=0.5))
     for network, last_gain in ((actor.module.network, 0.01), (critic.module, 1.0)):
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
         for layer, gain in zip(layers, (math.sqrt(2), math.sqrt(2), last_gain), strict=True):

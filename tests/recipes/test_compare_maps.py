@@ -15,7 +15,7 @@ from nht.recipes import collect_demos, compare_maps
 from nht.recipes.config import CollectDemos, CompareMaps
 from nht.recipes.launch import configure
 from nht.recipes.maps import figures as map_figures
-from nht.recipes.train_map import arm_of
+from nht.recipes.maps.kinds import arm_of
 
 KINDS = ["nht", "laser", "cae", "svd", "scl", "jacobian", "none"]
 

@@ -11,10 +11,11 @@ from torchrl.envs.utils import check_env_specs
 
 import nht
 from nht.envs import make_gymnasium
-from nht.recipes.agents.losses import reward_range
-from nht.recipes.config import DDPG, EnvConfig
+from nht.recipes.agents.returns import reward_range
+from nht.recipes.config import DDPG
 from nht.recipes.launch import configure
-from nht.recipes.run.environments import mapped_env, raw_actuation
+from nht.recipes.run.environments import check_env, mapped_env
+from nht.recipes.sections import EnvConfig
 
 SIZES = {"AdroitHandRelocate-v1": (39, 30), "AdroitHandDoor-v1": (39, 28)}
 
@@ -109,7 +110,7 @@ def test_the_hand_is_driven_through_a_map_of_its_demonstrations(action_dim):
     map = nht.NHT(39, 30, action_dim, hidden=(32,))
     metrics = nht.train_map(demos, map, context_keys=["observation"], max_steps=200).metrics
     assert metrics["validation_error"] < 1.0
-    with closing(mapped_env(config, map, None, seed=0)) as driven:
+    with closing(mapped_env(config, map, seed=0)) as driven:
         data = driven.rollout(5)
     assert data["action"].shape == (2, 5, action_dim)
     assert data["next", "actuation"].shape == (2, 5, 30)
@@ -119,7 +120,7 @@ def test_presets_and_raw_motors():
     for preset, name in [("adroit_relocate", "AdroitHandRelocate-v1"), ("adroit_door", "AdroitHandDoor-v1")]:
         config = configure(DDPG, "ddpg", [f"env={preset}", "map=none"]).env
         assert (config.suite, config.name) == ("gymnasium", name)
-        assert raw_actuation(config).actuation_dim == SIZES[name][1]
+        assert check_env(config) == SIZES[name][1]
 
 
 # Bad input.

@@ -7,10 +7,10 @@ import torch
 from tensordict.nn import TensorDictModule
 
 import nht
-from nht.recipes.config import EnvConfig
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.video import COLOURS, SHEET_COLUMNS, TILE, Film, contact_sheet, grid, record_video
+from nht.recipes.sections import EnvConfig
 
 STILL = TensorDictModule(lambda observation: torch.zeros(len(observation), 7), ["observation"], ["action"])
 DOWN = TensorDictModule(  # the second joint presses the tool into the table
@@ -23,7 +23,9 @@ FIRST_DOWN = TensorDictModule(
 
 def wipe(**options):
     config = EnvConfig(context_keys=[], options={"max_episode_steps": 9, **options})
-    return mapped_env(config, nht.Identity(7), 2.0, seed=0, num_envs=3)
+    map = nht.Identity(7)
+    map.action_scale.fill_(2.0)
+    return mapped_env(config, map, seed=0, num_envs=3)
 
 
 def tile(value):

@@ -26,7 +26,7 @@ from nht.recipes.launch import configure
 from nht.storage import describe
 from nht.transforms import ActionMapTransform
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 FORMATS = ("pt2", "onnx")
 # A seven-joint arm of no particular make: lengths [m], twists [rad], offsets [m].
 ARM = (

@@ -15,10 +15,11 @@ from torchrl.envs.utils import check_env_specs
 import nht
 from nht.envs import foreign, make_dm_control
 from nht.recipes import ddpg, evaluate
-from nht.recipes.agents.losses import reward_range
-from nht.recipes.config import DDPG, EnvConfig, Evaluate
+from nht.recipes.agents.returns import reward_range
+from nht.recipes.config import DDPG, Evaluate
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import base_env, mapped_env
+from nht.recipes.sections import EnvConfig
 from nht.transforms import ActionMapTransform
 
 # Flat entries, a matrix among them, a target that moves in the model, and a task without time limit or reward bounds.
@@ -119,7 +120,7 @@ def test_episodes_end_though_the_suite_knows_no_limit(monkeypatch):
 
 def test_any_observation_may_be_the_context():
     config = EnvConfig("reacher-easy", "dm_control", ["position", "to_target"], num_envs=2)
-    with closing(mapped_env(config, nht.NHT(4, 2, 1, hidden=(8,)), 1.0, seed=0)) as env:
+    with closing(mapped_env(config, nht.NHT(4, 2, 1, hidden=(8,)), seed=0)) as env:
         data = env.rollout(3)
     assert torch.equal(data["context"], torch.cat([data["position"], data["to_target"]], -1))
 
@@ -170,7 +171,7 @@ def test_unknown_names():
 def test_a_context_key_that_the_task_lacks():
     config = EnvConfig("reacher-easy", "dm_control", ["joint_angle"], num_envs=1)
     with pytest.raises(KeyError, match=r"no context key 'joint_angle'; it has \['position', 'to_target'"):
-        mapped_env(config, nht.NHT(2, 2, 1, hidden=(8,)), 1.0, seed=0)
+        mapped_env(config, nht.NHT(2, 2, 1, hidden=(8,)), seed=0)
 
 
 def test_settings_that_make_no_sense():

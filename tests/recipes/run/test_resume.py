@@ -15,12 +15,12 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 import fresh_process
 import tiny_runs
-from nht.recipes.config import RunConfig
 from nht.recipes.run import checkpoints
 from nht.recipes.run.checkpoint_file import CheckpointFile, write_checkpoint
 from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.record import Record
 from nht.recipes.run.statistics import Counters
-from nht.recipes.run.training import TrainingRun
+from nht.recipes.sections import RunConfig
 
 SETTINGS = ["algo.total_frames=600", "evaluation.every=300"]
 
@@ -58,8 +58,8 @@ def train_and_be_killed(algorithm: str, folder: Path, checkpoint: int) -> None:
 
 @pytest.mark.parametrize("checkpoint", [1, 2])
 def test_killed_while_writing_a_checkpoint(whole, checkpoint, tmp_path):
-    here, folder = Path(__file__).parent, tmp_path / "run"
-    code = f"import sys; sys.path.insert(0, {str(here)!r}); import test_resume; from pathlib import Path; "
+    places, folder = [str(Path(__file__).parent), str(Path(tiny_runs.__file__).parent)], tmp_path / "run"
+    code = f"import sys; sys.path[:0] = {places}; import test_resume; from pathlib import Path; "
     code += f"test_resume.train_and_be_killed({whole[0]!r}, Path({str(folder)!r}), {checkpoint})"
     process = fresh_process.run(code)
     assert process.returncode == -signal.SIGKILL, process.stderr
@@ -71,20 +71,21 @@ def test_killed_while_writing_a_checkpoint(whole, checkpoint, tmp_path):
     assert not list(written.glob(".*"))
 
 
-def test_told_to_end_between_two_evaluations(whole, tmp_path, monkeypatch, capsys):
-    before, count = signal.getsignal(signal.SIGTERM), TrainingRun.count_steps
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_told_to_end_between_two_evaluations(whole, number, tmp_path, monkeypatch, capsys):
+    before, count = signal.getsignal(number), Record.count_steps
 
     def tell(self, data):
         count(self, data)
         if self.counters.frames == 500:
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), number)
 
     with monkeypatch.context() as patched:
-        patched.setattr(TrainingRun, "count_steps", tell)
+        patched.setattr(Record, "count_steps", tell)
         with pytest.raises(SystemExit) as stopped:
             train(whole[0], tmp_path / "run")
-    assert signal.getsignal(signal.SIGTERM) == before
-    assert stopped.value.code == 128 + signal.SIGTERM
+    assert signal.getsignal(number) == before
+    assert stopped.value.code == 128 + number
     assert "was told to end: go on with run.resume=true" in capsys.readouterr().out
     assert (tmp_path / "run" / "checkpoints" / "checkpoint-000000000500.torchrl").exists()
     assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
@@ -226,11 +227,20 @@ def test_a_run_that_lacks_only_its_policy_is_finished(whole, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(whole[1], folder)
     (folder / "policy.safetensors").unlink()
+    (folder / "whole.json").unlink()
     before = pandas.read_csv(folder / "metrics.csv")
     assert_same(folder, train(whole[0], folder, "run.resume=auto"), whole)
     pandas.testing.assert_frame_equal(pandas.read_csv(folder / "metrics.csv"), before)
-    with pytest.raises(ValueError, match=r"has made its 600 steps: raise algo\.total_frames to go on"):
-        train(whole[0], folder, "run.resume=auto")
+
+
+def test_a_run_that_is_whole_says_so_and_stays(whole, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(whole[1], folder)
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != "config.yaml"}
+    assert_same(folder, train(whole[0], folder, "run.resume=auto"), whole)
+    assert f"{folder}: " in capsys.readouterr().out
+    after = {path: path.stat().st_mtime_ns for path in before if path.is_file()}
+    assert after == {path: before[path] for path in after}
 
 
 def test_the_clock_goes_on(whole, tmp_path):

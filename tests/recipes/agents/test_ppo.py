@@ -10,7 +10,7 @@ import torch
 import nht
 import nht.envs
 from nht.recipes import ddpg, evaluate, ppo
-from nht.recipes.agents.losses import GaussianPPOLoss
+from nht.recipes.agents.ppo import GaussianPPOLoss
 from nht.recipes.config import DDPG, PPO, Evaluate
 from nht.recipes.launch import configure
 from nht.recipes.run.folder import RunFolder, read_config

@@ -14,12 +14,13 @@ from torchrl.data.datasets import D4RLExperienceReplay
 import nht
 import nht.envs
 from nht.recipes import collect_demos, ddpg
-from nht.recipes.agents.networks import load_policy
-from nht.recipes.config import DDPG, CollectDemos, DemosConfig
+from nht.recipes.agents.policy import load_policy
+from nht.recipes.config import DDPG, CollectDemos
 from nht.recipes.data.recording import endings, has_success, record
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.folder import read_config
+from nht.recipes.sections import DemosConfig
 from toy_demos import CONTEXT, FLAGS, LENGTHS, as_rollout, demonstrations, episodes, same, write_hdf5
 
 
@@ -291,7 +292,7 @@ def test_a_policys_demonstrations_are_what_the_motors_got(run, tmp_path):
     assert demos.data["success"].squeeze(-1).equal(last)
     trained = read_config(run)
     map = nht.load_map(run / "map.safetensors")
-    env = mapped_env(trained.env, map, trained.map.action_scale, seed=0, num_envs=1)
+    env = mapped_env(trained.env, map, seed=0, num_envs=1)
     action = load_policy(run, env, trained.algo)(demos.data.select("observation").to_tensordict())["action"]
     low, high = (bound[0] for bound in (env.base_env.action_spec.low, env.base_env.action_spec.high))
     expected = map(action, demos.context(["tool_position", "joint_angle"])).clamp(low, high)
