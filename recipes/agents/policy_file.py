@@ -49,10 +49,14 @@ def read_policy(file: Path, expected: Mapping[str, Tensor]) -> dict[str, Tensor]
     except (SafetensorError, OSError, ValueError, RuntimeError, KeyError) as error:
         raise ValueError(f"{file} is no safetensors file, or is cut short: {shortened(error)}.") from error
     if about and (about.get("format") != FORMAT or about.get("sha256") != _checksum(found)):
-        raise ValueError(f"{file} was changed since it was written, or holds no policy: its checksum is another.")
+        raise ValueError(
+            f"{file} was changed since it was written, or holds no policy: its checksum is another."
+        )
     missing, unknown = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
     if missing or unknown:
-        raise ValueError(f"{file} is not of this policy: missing {shown(missing)}, unexpected {shown(unknown)}.")
+        raise ValueError(
+            f"{file} is not of this policy: missing {shown(missing)}, unexpected {shown(unknown)}."
+        )
     for name, value in found.items():
         own = expected[name]
         if value.shape != own.shape or value.dtype != own.dtype:

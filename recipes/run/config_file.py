@@ -53,7 +53,9 @@ def _check_values(settings: dict[str, Any], file: Path) -> None:
                 "looked up."
             )
         elif value is not None and not isinstance(value, (str, int, float, bool)):
-            raise ValueError(f"{file} holds a {type(value).__name__}, expected numbers, text, lists and names.")
+            raise ValueError(
+                f"{file} holds a {type(value).__name__}, expected numbers, text, lists and names."
+            )
 
 
 def check_code(settings: dict[str, Any], file: Path, allow: Sequence[str]) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pandas
 
-from nht.recipes.agents.table import find_algorithm
 from nht.reading import entry, known_entries, read_json, shortened
+from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.run.metrics import EVERY_RUN
 from nht.recipes.run.ownership import claimed

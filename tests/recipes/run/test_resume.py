@@ -175,9 +175,7 @@ def change_weights(members: dict[str, bytes]) -> None:
 def test_memory_mapped_parts_that_were_changed_are_noticed(whole, tmp_path):
     _, newest = broken_off(whole, tmp_path / "run")
     rewritten(newest, change_weights)
-    with pytest.warns(
-        UserWarning, match=r"checkpoint-\d+.*was changed since it was written: its checksum"
-    ):
+    with pytest.warns(UserWarning, match=r"checkpoint-\d+.*was changed since it was written: its checksum"):
         metrics = train(whole[0], tmp_path / "run", "run.resume=true")
     assert_same(tmp_path / "run", metrics, whole)
 
@@ -190,9 +188,7 @@ def test_networks_that_are_not_finite_are_refused(whole, tmp_path):
         states["loss"][name][0, 0] = float("nan")
         checkpoint.unlink()
         write_checkpoint(checkpoint, states)
-    with pytest.raises(
-        ValueError, match=r"checkpoint-\d+.torchrl, 'loss': .*weight holds 1 NaN or infinite"
-    ):
+    with pytest.raises(ValueError, match=r"checkpoint-\d+.torchrl, 'loss': .*weight holds 1 NaN or infinite"):
         train(whole[0], tmp_path / "run", "run.resume=true")
 
 
