@@ -1,17 +1,24 @@
 """Demonstrations come back as they were saved, and what is no demonstration is refused with a reason."""
 
 import json
+import os
 import pickle
+import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyMemmapStorage, ReplayBuffer
+from torchrl.data import ReplayBuffer
 
+import fresh_process
 import nht
 from nht.demos import Demos, load_demos, save_demos
+from nht.reading import checksum
+from nht.scratch import scratch
 
 
 def episodes(count: int = 4, length: int = 5) -> TensorDict:
@@ -58,18 +65,22 @@ def test_saved_demonstrations_come_back_bit_for_bit(tmp_path: Path) -> None:
 def test_the_buffer_samples_from_mapped_files_and_takes_nothing(tmp_path: Path) -> None:
     demos = save(tmp_path / "demos")
     assert isinstance(demos.buffer, ReplayBuffer)
-    assert isinstance(demos.buffer.storage, LazyMemmapStorage)
     batch = demos.buffer.sample(64)
     assert batch["actuation"].shape == (64, 7)
     assert batch["next", "tool_position"].shape == (64, 3)
-    assert Path(demos.data["actuation"].filename).is_relative_to(tmp_path)
+    file = tmp_path / "demos" / "data" / "actuation.memmap"
+    assert str(file) in Path("/proc/self/maps").read_text()
+    before = file.read_bytes()
+    demos.data["actuation"].zero_()
+    assert file.read_bytes() == before
     with pytest.raises(RuntimeError):
         demos.buffer.extend(episodes())
 
 
 def test_the_manifest_says_where_the_data_come_from(tmp_path: Path) -> None:
     manifest = save(tmp_path / "demos").manifest
-    assert manifest == json.loads((tmp_path / "demos" / "manifest.json").read_text())
+    written = json.loads((tmp_path / "demos" / "manifest.json").read_text())
+    assert written == manifest | {"checksum": checksum(manifest)}
     assert (manifest["env"], manifest["seed"], manifest["expert"]) == ("toy", 7, "scripted")
     assert manifest["settings"] == {"start": "fixed"}
     assert (manifest["episodes"], manifest["transitions"]) == (4, 20)
@@ -116,6 +127,34 @@ def test_tensors_of_ones_own_become_demonstrations() -> None:
     assert several.manifest["env"] == "mine"
 
 
+def test_numpy_arrays_become_demonstrations() -> None:
+    data = episodes()
+    found = Demos.from_tensors(
+        actuation=data["actuation"].numpy().astype(">f4"),
+        episode=data["episode"].numpy().astype(np.uint16),
+        context={"angle": data["joint_angle"].numpy().astype(np.float16)},
+        next_context={"angle": data["joint_angle"].tolist()},
+    )
+    assert torch.equal(found.actuation, data["actuation"])
+    assert torch.equal(found.episode, data["episode"])
+    assert torch.equal(found.data["angle"], data["joint_angle"].half().float())
+    with pytest.raises(ValueError, match=r"context, key 'order' must hold numbers or truth values.*<U4"):
+        Demos.from_tensors(
+            actuation=data["actuation"], episode=data["episode"], context={"order": np.array(20 * ["open"])}
+        )
+
+
+def test_demonstrations_are_saved_as_they_are(tmp_path: Path) -> None:
+    first = save(tmp_path / "first")
+    second = save_demos(first, tmp_path / "second")
+    assert second.manifest == first.manifest
+    assert save_demos(first, tmp_path / "third", expert="another").manifest["expert"] == "another"
+    assert repr(second) == (
+        "Demos(20 transitions in 4 episodes, env='toy', expert='scripted', keys: actuation (7,), done (1,), "
+        "episode (), joint_angle (7,), next/tool_position (3,), success (1,), tool_position (3,))"
+    )
+
+
 def test_nothing_is_overwritten_and_nothing_is_left_half_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -127,10 +166,47 @@ def test_nothing_is_overwritten_and_nothing_is_left_half_written(
     def fail(*_: Any) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(LazyMemmapStorage, "dumps", fail)
-    with pytest.raises(OSError, match="disk full"):
-        save(tmp_path / "more")
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "write_bytes", fail)
+        with pytest.raises(OSError, match="disk full"):
+            save(tmp_path / "more")
     assert [path.name for path in tmp_path.iterdir()] == ["demos"]
+
+
+def test_a_full_disk_is_noticed_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: room)
+    with pytest.raises(OSError, match=r"takes 0\.0 MB, only 0\.0 MB are left"):
+        save(tmp_path / "demos")
+    assert not list(tmp_path.iterdir())
+
+
+def save_and_be_killed(path: Path) -> None:
+    """Save, and be killed when all is written but not yet in its place."""
+    os.rename = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[assignment]
+    save(path)
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next_and_what_lives_stays(tmp_path: Path) -> None:
+    here = Path(__file__).parent
+    code = f"import sys; sys.path.insert(0, {str(here)!r}); import test_demos; from pathlib import Path; "
+    process = fresh_process.run(code + f"test_demos.save_and_be_killed(Path({str(tmp_path / 'demos')!r}))")
+    assert process.returncode == -signal.SIGKILL, process.stderr
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".demos.")
+    with scratch(tmp_path / "demos") as living:
+        assert not left.exists()
+        living.mkdir()
+        save(tmp_path / "demos")
+        assert living.exists()
+    old, recent = tmp_path / f".demos.{32 * '0'}", tmp_path / f".demos.{32 * '1'}"
+    for folder in (old, recent):  # as they were named without an owner
+        folder.mkdir()
+    os.utime(old, (0, 0))
+    with scratch(tmp_path / "demos"):
+        assert sorted(path.name for path in tmp_path.iterdir()) == [recent.name, "demos"]
 
 
 def test_settings_that_are_not_json_leave_nothing_behind(tmp_path: Path) -> None:

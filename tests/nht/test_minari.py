@@ -105,6 +105,36 @@ def test_a_dataset_that_others_wrote():
     assert found.data["success"].squeeze(-1).tolist() == [False, True, True]
     assert found.data["reward"].squeeze(-1).tolist() == [0.0, 0.5, 1.0]
     assert "order" not in found.data
+    assert found.manifest["settings"]["left_out_observations"] == ["order"]
+
+
+def test_observations_in_tuples_are_all_taken():
+    minari = pytest.importorskip("minari")
+    from gymnasium.spaces import Box, Dict, Tuple
+    from minari.data_collector import EpisodeBuffer
+
+    generator = np.random.default_rng(0)
+    first, second, third = (generator.normal(size=(4, width)) for width in (2, 3, 1))
+    space = Dict({"hand": Tuple((Box(-9, 9, (2,)), Box(-9, 9, (3,)))), "height": Box(-9, 9, (1,))})
+    buffer = EpisodeBuffer(
+        observations={"hand": (first, second), "height": third},
+        actions=np.zeros((3, 5), np.float32),
+        rewards=[0.0] * 3,
+        terminations=[False, False, True],
+        truncations=[False] * 3,
+        infos={},
+    )
+    with pytest.warns(UserWarning, match="author"):
+        minari.create_dataset_from_buffers(
+            "tuple-v0", [buffer], observation_space=space, action_space=Box(-1, 1, (5,))
+        )
+    found = nht.from_minari("tuple-v0")
+    for key, values in {("hand", "0"): first, ("hand", "1"): second, "height": third}.items():
+        np.testing.assert_array_equal(found.data[key], values[:-1])
+        np.testing.assert_array_equal(found.data["next"][key], values[1:])
+    assert "left_out_observations" not in found.manifest["settings"]
+    chosen = nht.from_minari("tuple-v0", context={"fingers": "hand/1"})
+    np.testing.assert_array_equal(chosen.data["fingers"], second[:-1])
 
 
 def test_a_minari_dataset_that_is_not_here_or_of_another_env(minari_home):
@@ -163,7 +193,10 @@ def damage_metadata(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (damage_cut, r"the Minari dataset toy-v0 cannot be read, it may be cut short"),
+        (
+            damage_cut,
+            r"the Minari dataset toy-v0 cannot be read: .*main_data.hdf5 cannot be read, it is cut short",
+        ),
         (damage_missing, r"toy-v0 cannot be read, it may be cut short.*episode_2"),
         (damage_actions, r"actions in episode 1 of toy-v0 must have shape \(3, 3\), got \(3, 4\)"),
         (
@@ -171,7 +204,10 @@ def damage_metadata(folder: Path) -> None:
             r"entry 'joint' of the observations in episode 1 of toy-v0 must have shape \(4, 2\)",
         ),
         (damage_spaces, r"toy-v0 cannot be read, it may be cut short or of another env: 'joint'"),
-        (damage_metadata, r"the Minari dataset toy-v0 cannot be read: Expecting"),
+        (
+            damage_metadata,
+            r"the Minari dataset toy-v0 cannot be read: .*metadata.json is not JSON: Expecting",
+        ),
     ],
 )
 def test_a_damaged_minari_dataset_is_refused_and_nothing_is_written(damage, message, minari_home, tmp_path):

@@ -54,6 +54,12 @@ THEIRS = {
 LAYERS = {
     "nht.geometry": 0,
     "nht.networks": 0,
+    "nht.reading": -1,
+    "nht.scratch": 0,
+    "nht.hdf5_file": 0,
+    "nht.minari_file": 1,
+    "nht.arrays": 0,
+    "nht.memmap": 0,
     "nht.episodes": 0,
     "nht.saturation": 0,
     "nht.arguments": 0,

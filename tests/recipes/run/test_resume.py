@@ -2,6 +2,7 @@
 
 import errno
 import os
+import pickle
 import shutil
 import signal
 import zipfile
@@ -9,12 +10,16 @@ from pathlib import Path
 
 import pandas
 import pytest
-from torchrl.checkpoint import Checkpoint
+import torch
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 import fresh_process
 import tiny_runs
+from nht.recipes.run import checkpoints
+from nht.recipes.run.checkpoint_file import CheckpointFile, write_checkpoint
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.record import Record
+from nht.recipes.run.statistics import Counters
 from nht.recipes.sections import RunConfig
 
 SETTINGS = ["algo.total_frames=600", "evaluation.every=300"]
@@ -39,7 +44,7 @@ def assert_same(folder: Path, metrics: pandas.DataFrame, whole) -> None:
 
 def train_and_be_killed(algorithm: str, folder: Path, checkpoint: int) -> None:
     """Train, and be killed at the moment when a checkpoint is written but not yet in its place."""
-    publish, written = Checkpoint._publish_path, []
+    publish, written = checkpoints.publish, []
 
     def kill(*paths):
         written.append(paths)
@@ -47,7 +52,7 @@ def train_and_be_killed(algorithm: str, folder: Path, checkpoint: int) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return publish(*paths)
 
-    Checkpoint._publish_path = staticmethod(kill)
+    checkpoints.publish = kill
     train(algorithm, folder)
 
 
@@ -58,12 +63,12 @@ def test_killed_while_writing_a_checkpoint(whole, checkpoint, tmp_path):
     code += f"test_resume.train_and_be_killed({whole[0]!r}, Path({str(folder)!r}), {checkpoint})"
     process = fresh_process.run(code)
     assert process.returncode == -signal.SIGKILL, process.stderr
-    checkpoints = tmp_path / "run" / "checkpoints"
-    assert len(list(checkpoints.glob("checkpoint-*"))) == checkpoint - 1
-    assert list(checkpoints.glob(".*"))
+    written = tmp_path / "run" / "checkpoints"
+    assert len(list(written.glob("checkpoint-*"))) == checkpoint - 1
+    assert list(written.glob(".*"))
     metrics = train(whole[0], tmp_path / "run", "run.resume=auto")
     assert_same(tmp_path / "run", metrics, whole)
-    assert not list(checkpoints.glob(".*"))
+    assert not list(written.glob(".*"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -123,6 +128,80 @@ def test_a_broken_checkpoint_is_passed_over(whole, damage, tmp_path):
     assert_same(tmp_path / "run", metrics, whole)
 
 
+def save_as_torchrl(self: checkpoints.Checkpoints, frames: int) -> None:
+    """As earlier versions wrote checkpoints: TorchRL's archive, in which a buffer's queue is pickled."""
+    parts = {name: getattr(part, "_buffer", part) for name, part in self._parts.items()}
+    rotation = CheckpointRotation(self._folder, keep_last=2)
+    rotation.save(Checkpoint(**parts, format="archive"), step=frames)
+
+
+def test_checkpoints_of_earlier_versions_are_read_without_unpickling(whole, tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints.Checkpoints, "save", save_as_torchrl)
+        _, newest = broken_off(whole, tmp_path / "run")
+    with zipfile.ZipFile(newest) as archive:
+        assert any(name.endswith("prefetch.pkl") for name in archive.namelist()) == (whole[0] == "ddpg")
+
+    def refuse(*_, **__):
+        raise AssertionError("unpickled")
+
+    for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
+        monkeypatch.setattr(module, name, refuse)
+    assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
+
+
+def test_torchrl_reads_our_checkpoints(whole):
+    checkpoint = max((whole[1] / "checkpoints").glob("checkpoint-*"))
+    counters = Counters()
+    Checkpoint(counters=counters).load(checkpoint)
+    assert counters.frames == 600
+
+
+def rewritten(checkpoint: Path, change) -> None:
+    """The archive with other contents of members, and right checksums of ZIP."""
+    with zipfile.ZipFile(checkpoint) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    with zipfile.ZipFile(checkpoint, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def change_weights(members: dict[str, bytes]) -> None:
+    name = max((name for name in members if "-loss/" in name), key=lambda name: len(members[name]))
+    members[name] = members[name][:-1] + bytes([members[name][-1] ^ 1])
+
+
+def test_memory_mapped_parts_that_were_changed_are_noticed(whole, tmp_path):
+    _, newest = broken_off(whole, tmp_path / "run")
+    rewritten(newest, change_weights)
+    with pytest.warns(UserWarning, match=r"checkpoint-\d+.*was changed since it was written: its checksum"):
+        metrics = train(whole[0], tmp_path / "run", "run.resume=true")
+    assert_same(tmp_path / "run", metrics, whole)
+
+
+def test_networks_that_are_not_finite_are_refused(whole, tmp_path):
+    for checkpoint in broken_off(whole, tmp_path / "run"):
+        with CheckpointFile(checkpoint) as file:
+            states = file.read()
+        name = next(name for name in states["loss"] if name.endswith("weight"))
+        states["loss"][name][0, 0] = float("nan")
+        checkpoint.unlink()
+        write_checkpoint(checkpoint, states)
+    with pytest.raises(ValueError, match=r"checkpoint-\d+.torchrl, 'loss': .*weight holds 1 NaN or infinite"):
+        train(whole[0], tmp_path / "run", "run.resume=true")
+
+
+def test_stray_files_are_passed_over(whole, tmp_path):
+    broken_off(whole, tmp_path / "run")
+    folder = tmp_path / "run" / "checkpoints"
+    for name in ("notes", "checkpoint-000000000300 (1).torchrl", "checkpoint-last", ".mine"):
+        (folder / name).write_text("hello")
+    assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
+    assert (folder / "notes").exists()
+    assert (folder / ".mine").exists()
+
+
 def test_nothing_but_broken_checkpoints(whole, tmp_path):
     for checkpoint in broken_off(whole, tmp_path / "run"):
         cut_short(checkpoint)
@@ -179,9 +258,9 @@ def test_a_full_disk(whole, tmp_path, monkeypatch, warned):
         if warned:
             room = shutil.disk_usage(tmp_path)._replace(free=1000)
             patched.setattr(shutil, "disk_usage", lambda _: room)
-            reason = r"the last one is of [\d.]+ MB, only 0.0 MB are left for the next"
+            reason = r"the next takes [\d.]+ MB, only 0\.0 MB are left in .*checkpoints"
         else:
-            patched.setattr(Checkpoint, "_publish_path", full)
+            patched.setattr(checkpoints, "publish", full)
             reason = "No space left on device"
         match = rf"no checkpoint after 600 steps: {reason}. The last one is .*checkpoint-000000000400"
         with pytest.raises(OSError, match=match):
