@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data.postprocs import MultiStep
 from torchrl.envs import EnvBase
-from torchrl.objectives import ClipPPOLoss, DDPGLoss, SoftUpdate
+from torchrl.objectives import ClipPPOLoss, DDPGLoss, LossModule, SoftUpdate
 from torchrl.objectives.value import GAE
 
 Range = tuple[float, float]
@@ -82,7 +82,7 @@ class JointSoftUpdate(SoftUpdate):
         eps: share of the target networks' parameters that stays; the rest comes from the networks.
     """
 
-    def __init__(self, loss: DDPGLoss, *, eps: float) -> None:
+    def __init__(self, loss: LossModule, *, eps: float) -> None:
         super().__init__(loss, eps=eps)
         names = list(self._sources.keys())
         self._learned = [leaf.data for name in names for leaf in self._sources[name].values(True, True)]

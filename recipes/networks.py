@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -224,7 +225,15 @@ def ddpg_networks(
     )
 
 
-def exploring(policy: TensorDictModule, env: EnvBase, algo: DDPGConfig) -> TensorDictSequential:
+class Exploration(Protocol):
+    """Settings of the noise on a deterministic policy's actions."""
+
+    exploration_noise: float
+    noise_memory: float
+    random_action: float
+
+
+def exploring(policy: TensorDictModule, env: EnvBase, algo: Exploration) -> TensorDictSequential:
     """The policy with noise added to its actions, or, at times, a uniform action instead.
 
     The noise is an Ornstein-Uhlenbeck process of deviation ``exploration_noise`` whose autocorrelation falls by
@@ -252,7 +261,14 @@ def load_policy(folder: Path, env: EnvBase, algo: AlgoConfig) -> TensorDictSeque
         RuntimeError: if the policy does not fit the environment.
         TypeError: if the algorithm is none of ours.
     """
+    from nht.recipes.agents.sac import SACConfig, sac_networks  # which import this module
+    from nht.recipes.agents.td3 import TD3Config, td3_networks
+
     match algo:
+        case TD3Config():
+            features, actor, _ = td3_networks(env, algo)
+        case SACConfig():
+            features, actor, _ = sac_networks(env, algo)
         case DDPGConfig():
             features, actor, _ = ddpg_networks(env, algo)
         case PPOConfig():

@@ -16,10 +16,12 @@ import yaml
 from omegaconf import OmegaConf
 from torchrl.record.loggers.wandb import WandbLogger
 
+from nht.recipes.agents.sac import SAC
+from nht.recipes.agents.td3 import TD3
 from nht.recipes.config import DDPG, PPO, RunConfig, Training
 from nht.storage import replacing
 
-RECIPES: dict[str, type[Training]] = {"DDPG": DDPG, "PPO": PPO}
+RECIPES: dict[str, type[Training]] = {"DDPG": DDPG, "PPO": PPO, "SAC": SAC, "TD3": TD3}
 """What ``config.yaml`` says of the algorithm, under ``recipe``; folders that say nothing hold DDPG."""
 
 LASTING = (
