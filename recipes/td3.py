@@ -56,12 +56,11 @@ def main(config: TD3) -> None:
                 for batch in minibatches(buffer, algo.updates_per_batch, batch_size, features, run.device):
                     actor_too = (run.counters.updates + 1) % algo.policy_delay == 0
                     losses = loss(batch, actor=actor_too)
-                    descend(list(losses.values()), optimiser, run.ranks)
+                    descend([losses["loss_actor"], losses["loss_qvalue"]], optimiser, run.ranks)
                     if actor_too:
                         target.step()
-                        losses["loss_actor"] *= (
-                            algo.policy_delay
-                        )  # so that its mean is that of the actor's updates
+                        # 0 in between: its mean over all updates is that over the actor's own.
+                        losses["loss_actor"] = algo.policy_delay * losses["loss_actor"].detach()
                     run.count_update(losses)
 
             if run.evaluation_due:
