@@ -363,8 +363,8 @@ class SearchConfig:
             raise ValueError(f"search.best_seeds must not be negative, got {self.best_seeds}.")
         if self.metric not in ("success", "return"):
             raise ValueError(f"search.metric must be success or return, got {self.metric!r}.")
-        if self.recipe not in ("ddpg", "ppo"):
-            raise ValueError(f"search.recipe must be ddpg or ppo, got {self.recipe!r}.")
+        if self.recipe not in ("ddpg", "ppo", "sac", "td3"):
+            raise ValueError(f"search.recipe must be ddpg, ppo, sac or td3, got {self.recipe!r}.")
 
 
 @dataclass

@@ -16,13 +16,20 @@ from typing import Any
 
 import pandas
 
-from nht.recipes import ddpg, ppo
+from nht.recipes import ddpg, ppo, sac, td3
+from nht.recipes.agents.sac import SAC
+from nht.recipes.agents.td3 import TD3
 from nht.recipes.config import DDPG, PPO
 from nht.recipes.launch import configure
 from nht.recipes.search_space import VERSION, Value
 from nht.storage import replacing
 
-RECIPES: dict[str, Any] = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}
+RECIPES: dict[str, Any] = {
+    "ddpg": (ddpg.main, DDPG),
+    "ppo": (ppo.main, PPO),
+    "sac": (sac.main, SAC),
+    "td3": (td3.main, TD3),
+}
 HEARTBEAT, SILENCE = 30.0, 300.0
 """Seconds between two signs of life, and after how many without one a claim is void."""
 
@@ -39,7 +46,7 @@ class Task:
         interface: whose run.
         configuration: its number.
         seed: of map and agent.
-        recipe: ``ddpg`` or ``ppo``.
+        recipe: ``ddpg``, ``ppo``, ``sac`` or ``td3``.
         metric: what the run is judged by, ``success`` or ``return``.
         parameters: what was drawn, by dotted name.
         overrides: everything that the recipe is told, the run's folder aside.

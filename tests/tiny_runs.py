@@ -2,11 +2,18 @@
 
 import pandas
 
-from nht.recipes import ddpg, ppo
+from nht.recipes import ddpg, ppo, sac, td3
+from nht.recipes.agents.sac import SAC
+from nht.recipes.agents.td3 import TD3
 from nht.recipes.config import DDPG, PPO
 from nht.recipes.launch import configure
 
-RECIPES = {"ddpg": (ddpg.main, DDPG), "ppo": (ppo.main, PPO)}
+RECIPES = {
+    "ddpg": (ddpg.main, DDPG),
+    "ppo": (ppo.main, PPO),
+    "sac": (sac.main, SAC),
+    "td3": (td3.main, TD3),
+}
 SHARED = [
     "env=wam_wipe",
     "map=none",
@@ -19,9 +26,12 @@ SHARED = [
     "run.checkpoint_every=200",
     "run.wandb=false",
 ]
+REPLAY = ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"]
 OWN = {
-    "ddpg": ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"],
+    "ddpg": REPLAY,
     "ppo": ["algo.minibatches=5", "algo.epochs=2"],
+    "sac": [*REPLAY, "algo.random_frames=200"],
+    "td3": [*REPLAY, "algo.random_frames=200"],
 }
 
 

@@ -108,7 +108,6 @@ def minibatches(
 def descend(losses: Sequence[Tensor], optimiser: torch.optim.Optimizer, ranks: Ranks) -> None:
     """One gradient step on the sum of ``losses``, scalars: on the minibatches of all ranks as if they were one."""
     torch.stack(list(losses)).sum().backward()
-    for group in optimiser.param_groups:
-        ranks.average_gradients(group["params"])
+    ranks.average_gradients(weight for group in optimiser.param_groups for weight in group["params"])
     optimiser.step()
     optimiser.zero_grad()
