@@ -61,13 +61,19 @@ def report_runs(config: Report) -> None:
 def read_runs(folders: list[Path]) -> pandas.DataFrame:
     """The evaluations of all runs in or below ``folders``, a row each, with the run's interface and seed.
 
+    Where the runs are of several algorithms, an interface is named with the algorithm that used it.
+
     Raises:
         FileNotFoundError: if there is no run with an evaluation.
     """
     metrics = sorted({path for folder in folders for path in folder.rglob("metrics.csv")})
     if not metrics:
         raise FileNotFoundError(f"no metrics.csv in or below {[str(folder) for folder in folders]}.")
-    return pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
+    curves = pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
+    algorithms = curves.pop("algorithm")
+    if algorithms.nunique() > 1:
+        curves["interface"] = algorithms + ", " + curves["interface"]
+    return curves
 
 
 def _read_run(metrics: Path) -> pandas.DataFrame:
@@ -76,6 +82,7 @@ def _read_run(metrics: Path) -> pandas.DataFrame:
     interface = "raw" if config.map.kind == "none" else config.map.kind
     rows.insert(0, "interface", interface)
     rows.insert(1, "seed", config.seed)
+    rows["algorithm"] = type(config).__name__
     return rows
 
 

@@ -1,5 +1,7 @@
 """What TD3 and SAC share: critics called in pairs, the buffer, runs on every task and map, settings out of range."""
 
+from copy import deepcopy
+
 import pandas
 import pytest
 import torch
@@ -21,7 +23,7 @@ from nht.recipes.networks import RunningNorm
 from nht.recipes.run_folder import read_config
 
 ALGORITHMS = ("sac", "td3")
-SHORT = ("algo.total_frames=200", "evaluation.every=200")
+SHORT = ("algo.total_frames=100", "evaluation.every=100", "algo.random_frames=0")
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
@@ -33,14 +35,16 @@ def test_a_pair_of_critics_gives_what_each_gives_alone(bfloat16, hidden):
     pair = CriticPair(critic.module, loss.qvalue_network_params)
     features, action = torch.randn(32, 17), torch.rand(32, 6)
     values = pair(features, action)
+    tolerance = {"rtol": 0.02, "atol": 0.02} if bfloat16 else {}  # sums are rounded in another order
     for number in range(2):
-        with loss.qvalue_network_params[number].to_module(critic):
-            alone = critic.module(features, action).squeeze(-1)
-        tolerance = {"rtol": 0.02, "atol": 0.02} if bfloat16 else {}  # sums are rounded in another order
+        network = deepcopy(critic.module)
+        for name, weight in network.named_parameters():
+            weight.data.copy_(loss.qvalue_network_params["module", *name.split(".")][number])
+        alone = network(features, action).squeeze(-1)
         torch.testing.assert_close(values[number], alone, **tolerance)
     assert not torch.equal(values[0], values[1])  # they start apart
     assert torch.equal(pair.fixed(features, action), values)
-    assert torch.equal(pair.fixed(features, action, critics=1), values[:1])
+    torch.testing.assert_close(pair.fixed(features, action, critics=1), values[:1], **tolerance)
 
 
 def test_critics_start_near_the_lowest_return():
@@ -73,7 +77,7 @@ def test_the_buffer_keeps_what_is_needed_of_steps_that_are_sound():
     collected["action"][2] = float("nan")
     kept = storable(collected.reshape(2, 3))
     assert kept.shape == (5,)
-    assert kept.to_tensordict().select(*STORED).keys(True, True) == kept.keys(True, True)
+    assert set(kept.keys(True, True)) == set(STORED)
     assert kept["observation"].equal(collected["observation"][[0, 1, 3, 4, 5]])
 
 
