@@ -84,7 +84,15 @@ def learn(run: Path, task: str, seed: int, map_file: Path) -> None:
     quiet = ["evaluation.video=false", "run.wandb=false", "run.checkpoint_every=102_400", "run.resume=auto"]
     if recipe == "ddpg":
         quiet[2] = "run.checkpoint_every=20_000"
-    call(recipe, *TASKS[task]["map"], *settings, *quiet, f"map.file={map_file}", f"run.folder={run}", f"seed={seed}")
+    call(
+        recipe,
+        *TASKS[task]["map"],
+        *settings,
+        *quiet,
+        f"map.file={map_file}",
+        f"run.folder={run}",
+        f"seed={seed}",
+    )
     (run / "finished").touch()
 
 
@@ -106,7 +114,9 @@ def write(folder: Path) -> None:
                     if (run / "finished").exists():
                         with (run / "metrics.csv").open() as metrics:
                             for row in csv.DictReader(metrics):
-                                writer.writerow([task, kind, seed, row["frames"], *(row[key] for key in COLUMNS)])
+                                writer.writerow(
+                                    [task, kind, seed, row["frames"], *(row[key] for key in COLUMNS)]
+                                )
 
 
 if __name__ == "__main__":

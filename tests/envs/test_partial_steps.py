@@ -113,7 +113,9 @@ def test_flags_of_copies_that_stand_still_are_saved(name):
 def test_what_is_returned_belongs_to_the_caller():
     task, twin = going("wam_wipe").task, going("wam_wipe").task
     for rows in ([1], [], [0, 2]):
-        outcome, expected = (each.step(drawn(task)[0], np.array(rows, dtype=np.intp)) for each in (task, twin))
+        outcome, expected = (
+            each.step(drawn(task)[0], np.array(rows, dtype=np.intp)) for each in (task, twin)
+        )
         np.testing.assert_array_equal(outcome.failure, expected.failure)
         outcome.failure[:] = ~outcome.failure
 
