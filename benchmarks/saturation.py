@@ -1,7 +1,7 @@
 """What happens at the motors' limits, ``scale`` or ``clip``: learning with either, through the same maps.
 
-Three tasks, three seeds each; the action scales are large enough for policies to meet the limits. One process at a time.
-A run that is finished is not repeated, one that was interrupted goes on. Every evaluation is a row of
+Three tasks, three seeds each; the action scales are large enough for policies to meet the limits. One process at a
+time. A run that is finished is not repeated, one that was interrupted goes on. Every evaluation is a row of
 ``benchmarks/results/saturation.csv``.
 
     python benchmarks/saturation.py FOLDER [TASK ...]
