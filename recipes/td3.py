@@ -18,12 +18,12 @@ from nht.recipes.agents.off_policy import (
 )
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.agents.td3 import TD3, DirectTD3Loss, networks
-from nht.recipes.envs.trainironments import RunEnvs
 from nht.recipes.launch import launch
-from nht.recipes.ranks import Ranks
+from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.loop import Loop
+from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
 
 
