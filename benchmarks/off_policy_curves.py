@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pandas
 
-from nht.recipes.report import plot, read_runs, summarise
-from nht.recipes.search_report import to_markdown
+from nht.recipes.study.curves import plot, read_runs, summarise
+from nht.recipes.study.report import to_markdown
 
 RESULTS = Path(__file__).with_name("results")
 COLUMNS = ["interface", "seed", "frames", "eval_return", "updates", "seconds"]

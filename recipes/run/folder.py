@@ -22,7 +22,7 @@ import nht
 from nht.reading import shortened
 from nht.recipes.agents.table import find_algorithm, name_of
 from nht.recipes.maps.interface import run_map
-from nht.recipes.maps.kinds import default_scale, map_context_keys
+from nht.recipes.maps.kinds import default_scale, find_kind, map_context_keys
 from nht.recipes.run.config_file import check_code, read_settings
 from nht.recipes.run.dashboard import Dashboard, open_dashboard
 from nht.recipes.run.environments import check_env, mapped_env
@@ -252,10 +252,23 @@ def _read(settings: Path, allow: Sequence[str] = ()) -> tuple[str, Training]:
         raise ValueError(f"{settings} is no configuration of a run: {shortened(error)}.") from error
 
 
-def kept_map(folder: Path, config: Training, device: torch.device | str = "cpu") -> nht.ActionMap:
-    """The action map of a run; of one that an earlier version made, with the scale that its configuration has."""
+def kept_map(
+    folder: Path, config: Training, device: torch.device | str = "cpu", allow: Sequence[str] = ()
+) -> nht.ActionMap:
+    """The action map of a run; of one that an earlier version made, with the scale that its configuration has.
+
+    Args:
+        folder: of the run.
+        config: of the run.
+        device: where the map goes.
+        allow: packages whose classes the map's file may name, beside that of the kind of map.
+
+    Raises:
+        FileNotFoundError, ValueError: as ``nht.load_map``.
+    """
     path = folder / MAP_FILE
-    map = nht.load_map(path, device=device)
+    own = find_kind(config.map.kind).map_class.__module__  # the configuration names it
+    map = nht.load_map(path, device=device, allow=[*allow, own])
     scale = config.map.action_scale
     if format_version(path) == 1 and config.map.scale_is_set and scale is not None:
         map.action_scale.fill_(scale)
