@@ -51,7 +51,10 @@ def report_runs(config: Report) -> None:
     for name, group in found:
         start = f"{name}-" if len(found) > 1 else ""
         table = summarise(group, config.metric, config.lines)
-        files = [f"{start}{'' if config.metric == SUCCESS else 'return-'}table.md", f"{start}{config.metric}.png"]
+        files = [
+            f"{start}{'' if config.metric == SUCCESS else 'return-'}table.md",
+            f"{start}{config.metric}.png",
+        ]
         (out / files[0]).write_text(to_markdown(table))
         plot(group, config.metric, config.title or name.replace("-", ", "), out / files[1], config.lines)
         written += files

@@ -39,7 +39,9 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
         raise FileNotFoundError(f"no {METRICS_FILE} in or below {[str(folder) for folder in folders]}.")
     curves = pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
     if curves.empty:
-        raise FileNotFoundError(f"no run in or below {[str(folder) for folder in folders]} has an evaluation yet.")
+        raise FileNotFoundError(
+            f"no run in or below {[str(folder) for folder in folders]} has an evaluation yet."
+        )
     widths = curves.groupby(["task", "interface"])["action_dim"].transform("nunique")
     named = curves["interface"] + " (k = " + curves["action_dim"].astype(str) + ")"
     return curves.assign(interface=curves["interface"].where(widths == 1, named)).drop(columns="action_dim")
@@ -74,9 +76,7 @@ def groups(curves: pandas.DataFrame, lines: str) -> Iterator[tuple[str, pandas.D
         yield f"{task}-{same}", group
 
 
-def summarise(
-    curves: pandas.DataFrame, metric: str = SUCCESS, lines: str = "interface"
-) -> pandas.DataFrame:
+def summarise(curves: pandas.DataFrame, metric: str = SUCCESS, lines: str = "interface") -> pandas.DataFrame:
     """Per interface, or algorithm: seeds, steps, and the mean and interquartile mean over seeds of the last evaluation of all.
 
     For success also the failures, and the median of the steps to a success of 0.9.
