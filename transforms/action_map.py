@@ -132,6 +132,7 @@ class ActionMapTransform(Attachment):
             return tensordict
         if not torch.compiler.is_compiling():
             self._check_place()
+            self._check_no_buffer()
         action = self._repeats.policy_action(tensordict, tensordict[self.action_key])
         context = tensordict.get(self.context_key) if self.context_keys else action[..., :0]
         if context is None:
