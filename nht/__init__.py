@@ -2,13 +2,14 @@
 
 from importlib.metadata import version
 
+from nht.actuation_lipschitz import actuation_certificate
 from nht.align import Aligned, align
 from nht.demos import Demos, load_demos, save_demos
 from nht.export import export_map
 from nht.hdf5 import from_hdf5
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
-from nht.lipschitz import certificate
+from nht.lipschitz import certificate, offset_certificate
 from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
 from nht.minari import from_minari, to_minari
 from nht.residual import Residual
@@ -30,6 +31,7 @@ __all__ = [
     "LinearActionMap",
     "MapTraining",
     "Residual",
+    "actuation_certificate",
     "align",
     "certificate",
     "export_map",
@@ -37,6 +39,7 @@ __all__ = [
     "from_minari",
     "load_demos",
     "load_map",
+    "offset_certificate",
     "projection_error",
     "save_demos",
     "save_map",

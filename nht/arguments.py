@@ -36,8 +36,8 @@ def recorded(map: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> d
     return kept
 
 
-def constructor_arguments(map: nn.Module, given: Mapping[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """The arguments that make a twin of ``map``: by position, where there is no other way, and by name.
+def named_arguments(map: nn.Module, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments by name that, after those of `positional_arguments`, make a twin of ``map``.
 
     Args:
         map: an object that has been constructed; its attributes go before what was given.
@@ -46,22 +46,35 @@ def constructor_arguments(map: nn.Module, given: Mapping[str, Any]) -> tuple[tup
     Raises:
         TypeError: if one is neither an attribute that can stand in a file nor was given as such.
     """
-    parameters = list(inspect.signature(type(map).__init__).parameters.values())[1:]
-    by_position = max((i for i, one in enumerate(parameters) if one.kind in POSITIONAL), default=-1)
-    positional: list[Any] = []
     named: dict[str, Any] = {}
-    for i, parameter in enumerate(parameters):
-        name = parameter.name
-        if parameter.kind is inspect.Parameter.VAR_POSITIONAL:
-            positional += _given(map, name, given)
-        elif parameter.kind is inspect.Parameter.VAR_KEYWORD:
-            rest = _given(map, name, given)
-            named |= {key: _argument(map, key, rest) for key in rest}
-        elif i < by_position:
-            positional.append(_argument(map, name, given))
+    for parameter in _parameters(map)[_by_position(map) :]:
+        if parameter.kind is inspect.Parameter.VAR_KEYWORD:
+            others = _given(map, parameter.name, given)
+            named |= {name: _argument(map, name, others) for name in others}
         else:
-            named[name] = _argument(map, name, given)
-    return tuple(positional), named
+            named[parameter.name] = _argument(map, parameter.name, given)
+    return named
+
+
+def positional_arguments(map: nn.Module, given: Mapping[str, Any]) -> tuple[Any, ...]:
+    """The arguments that can be given by position alone, and those before them; arguments and errors as above."""
+    values: list[Any] = []
+    for parameter in _parameters(map)[: _by_position(map)]:
+        if parameter.kind is inspect.Parameter.VAR_POSITIONAL:
+            values += _given(map, parameter.name, given)
+        else:
+            values.append(_argument(map, parameter.name, given))
+    return tuple(values)
+
+
+def _parameters(map: nn.Module) -> list[inspect.Parameter]:
+    return list(inspect.signature(type(map).__init__).parameters.values())[1:]
+
+
+def _by_position(map: nn.Module) -> int:
+    """How many parameters must be given by position: up to the last of those that have no name."""
+    kinds = [parameter.kind for parameter in _parameters(map)]
+    return max((i + 1 for i, kind in enumerate(kinds) if kind in POSITIONAL), default=0)
 
 
 def plain(value: Any) -> Any:
@@ -80,7 +93,9 @@ def plain(value: Any) -> Any:
         return [plain(one) for one in value]
     if isinstance(value, dict) and all(isinstance(key, str) for key in value):
         return {key: plain(one) for key, one in value.items()}
-    raise TypeError(f"{type(value).__name__} is neither number, text, None, map, nor a list or dict of these.")
+    raise TypeError(
+        f"{type(value).__name__} is neither number, text, None, map, nor a list or dict of these."
+    )
 
 
 def _is_map(value: Any) -> bool:

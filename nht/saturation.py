@@ -87,6 +87,8 @@ def scale_into(
 
 def _excess(way: Tensor, room: Tensor) -> Tensor:
     """The largest way per room for it, (*batch, 1); ways of no or negative length, and negative room, count as 0."""
-    least = torch.finfo(room.dtype).tiny ** 0.5  # instead of no room at all, for quotient and slope to stay finite
+    least = (
+        torch.finfo(room.dtype).tiny ** 0.5
+    )  # instead of no room at all, for quotient and slope to stay finite
     share = torch.where(room < 0, torch.zeros_like(room), way / room.clamp_min(least))
     return share.amax(-1, keepdim=True)

@@ -64,10 +64,14 @@ LAYERS = {
     "nht.linear_map": 2,
     "nht.maps": 3,
     "nht.lipschitz": 5,
-    "nht.storage": 6,
-    "nht.train": 7,
-    "nht.export": 7,
-    "nht": 8,
+    "nht.replacing": 0,
+    "nht.actuation_lipschitz": 6,
+    "nht.map_classes": 5,
+    "nht.description": 6,
+    "nht.storage": 7,
+    "nht.train": 8,
+    "nht.export": 8,
+    "nht": 9,
 }
 FAMILY_LAYER = 4
 
