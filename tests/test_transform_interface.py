@@ -100,7 +100,10 @@ def test_states_saved_when_the_transform_had_a_scale_of_its_own():
     old = {f"map.{key}": value for key, value in saturated("clip").state_dict().items()}
     old["action_scale"] = torch.tensor(SCALE)
     for state, target in (
-        (old, TransformedEnv(ToyArm((3,)), ActionMapTransform(NHT(5, 3, 2, hidden=(8,), seed=1), CONTEXT_KEYS))),
+        (
+            old,
+            TransformedEnv(ToyArm((3,)), ActionMapTransform(NHT(5, 3, 2, hidden=(8,), seed=1), CONTEXT_KEYS)),
+        ),
         (
             {f"transforms.1.{key}": value for key, value in old.items()},
             TransformedEnv(
@@ -134,7 +137,9 @@ def test_maps_of_half_precision(floats, env_floats, make, saturation):
     assert torch.equal(data["next", "actuation"], data["next", "received"])
     assert data["next", "actuation"].abs().max() <= LIMIT  # not beyond it by rounding to fewer digits
     exact = transform.map.double().decode(
-        data["action"], data["context"], *(sign * torch.full((3,), LIMIT, dtype=torch.float64) for sign in (-1, 1))
+        data["action"],
+        data["context"],
+        *(sign * torch.full((3,), LIMIT, dtype=torch.float64) for sign in (-1, 1)),
     )
     torch.testing.assert_close(data["next", "actuation"].double(), exact, atol=0.05, rtol=0.05)
 

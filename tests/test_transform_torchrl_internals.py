@@ -121,7 +121,9 @@ def test_methods_in_an_objects_dict_go_first_and_clones_are_without_them():
 
 def test_a_parent_reads_as_early_as_the_chain_it_was_taken_from():
     first, second, early = norm(), StepCounter(), Early()
-    env = TransformedEnv(ToyArm((2,)), Compose(Compose(StepCounter(step_count_key="own"), first), second, early))
+    env = TransformedEnv(
+        ToyArm((2,)), Compose(Compose(StepCounter(step_count_key="own"), first), second, early)
+    )
     let_read_early(env.transform)
     for transform in (first, second):
         parent = transform.parent

@@ -58,15 +58,17 @@ class ActionMapTransform(Attachment):
         context_key: the copy of the context.
         executed_key: the executed actuation.
         forward_only: for replay buffers. To attach such an instance to an environment is an error.
+        allow: modules that may be imported for the class of a map in a file, see ``nht.load_map``.
 
     Raises:
         TypeError: if ``map`` is neither map nor path; on attaching, if a context entry or the actuation is not of
             floats.
         FileNotFoundError: if there is no such file.
-        ValueError: on an ``action_scale`` that is not positive and finite, on another ``saturation``, on context keys
-            that are missing or in another order than the map's, on keys that collide; on attaching, if the width of
-            context or actuation is not the map's, if the environment has entries of its own under our keys, or if the
-            raw context cannot be read because of other transforms; at a step, if the action has another width than k.
+        ValueError: on a file that is none of a map, on an ``action_scale`` that is not positive and finite, on another
+            ``saturation``, on context keys that are missing or in another order than the map's, on keys that collide;
+            on attaching, if the width of context or actuation is not the map's, if the environment has entries of its
+            own under our keys, or if the raw context cannot be read because of other transforms; at a step, if the
+            action has another width than k.
         KeyError: on attaching, if the environment lacks a context key or the actuation key.
     """
 
@@ -84,8 +86,9 @@ class ActionMapTransform(Attachment):
         context_key: NestedKey = "context",
         executed_key: NestedKey = "actuation",
         forward_only: bool = False,
+        allow: Sequence[str] = (),
     ) -> None:
-        map = take_map(map, action_scale, saturation)
+        map = take_map(map, action_scale, saturation, allow)
         keys = resolve_context_keys(map, context_keys)
         action_key, actuation_key = unravel_key(action_key), unravel_key(actuation_key)
         context_key, executed_key = unravel_key(context_key), unravel_key(executed_key)
