@@ -173,13 +173,34 @@ def test_a_policy_of_another_width(width, batched):
         env.rollout(3, policy)
 
 
-def test_a_replay_buffer_needs_a_transform_that_goes_forward_only():
-    data = TensorDict(action=torch.ones(4, 3), joint=torch.ones(4, 3), batch_size=4)
-    for transform in (ActionMapTransform(Identity(3)), mapped_arm((2,)).transform.clone()):
-        buffer = ReplayBuffer(storage=LazyTensorStorage(4))
-        buffer.append_transform(transform)
-        with pytest.raises(ValueError, match=r"such as that of a replay buffer, .* with forward_only=True\."):
-            buffer.extend(data)
+def recorded(**more):
+    return TensorDict(
+        action=torch.ones(4, 3), tool=torch.ones(4, 2), joint=torch.ones(4, 3), **more, batch_size=4
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "data"),
+    [
+        (toy_transform, recorded()),
+        (toy_transform, recorded(context=torch.ones(4, 5))),
+        (lambda: ActionMapTransform(Identity(3)), recorded(next={"joint": torch.ones(4, 3)})),
+        (lambda: mapped_arm((4,)).transform.clone(), mapped_arm((4,)).rollout(1)[:, 0]),
+    ],
+    ids=["no context", "no policy's action", "transitions", "a clone of an environment's"],
+)
+def test_a_replay_buffer_needs_a_transform_that_goes_forward_only(make, data):
+    buffer = ReplayBuffer(storage=LazyTensorStorage(4))
+    buffer.append_transform(make())
+    with pytest.raises(ValueError, match=r"of a replay buffer, make a transform with forward_only=True\."):
+        buffer.extend(data)
+
+
+def test_without_an_environment_a_chain_maps_a_policys_action():
+    data = TensorDict(action=torch.ones(4, 2), context=torch.ones(4, 5), batch_size=4)
+    mapped = Compose(toy_transform()).inv(data)
+    expected = toy_map()(1.5 * data["action"], data["context"])
+    torch.testing.assert_close(mapped["action"], expected.detach())
 
 
 def test_several_actuations_at_once_have_no_context():

@@ -135,12 +135,24 @@ class ActionMapTransform(Attachment):
             return tensordict
         if not torch.compiler.is_compiling():
             self._check_place()
-            self._check_no_buffer()
         action = self._repeats.policy_action(tensordict, tensordict[self.action_key])
         context = tensordict.get(self.context_key) if self.context_keys else action[..., :0]
-        if context is None:
+        if self._low is None:
+            self._check_not_recorded(tensordict, action, context)
+        elif context is None:
             raise KeyError(f"no {self.context_key!r} beside the action: pass on what reset or step returned.")
         return tensordict.set(self.actuation_key, self.map.decode(action, context, self._low, self._high))
+
+    def _check_not_recorded(self, tensordict: TensorDictBase, action: Tensor, context: Tensor | None) -> None:
+        """Without an environment: data that are no policy's action in its context are those of a replay buffer."""
+        if context is None or "next" in tensordict or action.shape[-1] != self.map.action_dim:
+            beside = f" and {self.context_key!r}" if self.context_keys else ""
+            raise ValueError(
+                f"without an environment inv maps a policy's action: it reads {self.action_key!r}, (*batch, "
+                f"{self.map.action_dim}){beside}; got {self.action_key!r} {tuple(action.shape)} among "
+                f"{sorted(map(str, tensordict.keys(True, True)))}. "
+                "For the recorded data of a replay buffer, make a transform with forward_only=True."
+            )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.context_keys and not self.reads_early:

@@ -22,7 +22,6 @@ from nht.transforms.context import check_context, check_writers, read_context
 from nht.transforms.torchrl_internals import (
     EarlyReader,
     completes_the_environment,
-    containers,
     leaves,
     let_read_early,
     surroundings,
@@ -124,14 +123,6 @@ class Attachment(EarlyReader):
         """Looks around again, if the chain has changed since. To be called before the environment is."""
         if not self._is_current:
             self._attach()
-
-    def _check_no_buffer(self) -> None:
-        """Nobody takes this for a replay buffer's transform."""
-        if self._low is None and any(True for _ in containers(self)):
-            raise ValueError(
-                "this ActionMapTransform is in a chain without an environment, such as that of a replay buffer, "
-                "where inv would map recorded actions: make one with forward_only=True."
-            )
 
     def _attach(self) -> None:
         """Checks map against environment, if there is one by now, and reads what holds for all steps."""
