@@ -58,15 +58,17 @@ class ActionMapTransform(Attachment):
         context_key: the copy of the context.
         executed_key: the executed actuation.
         forward_only: for replay buffers. To attach such an instance to an environment is an error.
+        allow: modules that may be imported for the class of a map in a file, see ``nht.load_map``.
 
     Raises:
         TypeError: if ``map`` is neither map nor path; on attaching, if a context entry or the actuation is not of
             floats.
         FileNotFoundError: if there is no such file.
-        ValueError: on an ``action_scale`` that is not positive and finite, on another ``saturation``, on context keys
-            that are missing or in another order than the map's, on keys that collide; on attaching, if the width of
-            context or actuation is not the map's, if the environment has entries of its own under our keys, or if the
-            raw context cannot be read because of other transforms; at a step, if the action has another width than k.
+        ValueError: on a file that is none of a map, on an ``action_scale`` that is not positive and finite, on another
+            ``saturation``, on context keys that are missing or in another order than the map's, on keys that collide;
+            on attaching, if the width of context or actuation is not the map's, if the environment has entries of its
+            own under our keys, or if the raw context cannot be read because of other transforms; at a step, if the
+            action has another width than k.
         KeyError: on attaching, if the environment lacks a context key or the actuation key.
     """
 
@@ -84,8 +86,9 @@ class ActionMapTransform(Attachment):
         context_key: NestedKey = "context",
         executed_key: NestedKey = "actuation",
         forward_only: bool = False,
+        allow: Sequence[str] = (),
     ) -> None:
-        map = take_map(map, action_scale, saturation)
+        map = take_map(map, action_scale, saturation, allow)
         keys = resolve_context_keys(map, context_keys)
         action_key, actuation_key = unravel_key(action_key), unravel_key(actuation_key)
         context_key, executed_key = unravel_key(context_key), unravel_key(executed_key)
@@ -134,9 +137,22 @@ class ActionMapTransform(Attachment):
             self._check_place()
         action = self._repeats.policy_action(tensordict, tensordict[self.action_key])
         context = tensordict.get(self.context_key) if self.context_keys else action[..., :0]
-        if context is None:
+        if self._low is None:
+            self._check_not_recorded(tensordict, action, context)
+        elif context is None:
             raise KeyError(f"no {self.context_key!r} beside the action: pass on what reset or step returned.")
         return tensordict.set(self.actuation_key, self.map.decode(action, context, self._low, self._high))
+
+    def _check_not_recorded(self, tensordict: TensorDictBase, action: Tensor, context: Tensor | None) -> None:
+        """Without an environment: data that are no policy's action in its context are those of a replay buffer."""
+        if context is None or "next" in tensordict or action.shape[-1] != self.map.action_dim:
+            beside = f" and {self.context_key!r}" if self.context_keys else ""
+            raise ValueError(
+                f"without an environment inv maps a policy's action: it reads {self.action_key!r}, (*batch, "
+                f"{self.map.action_dim}){beside}; got {self.action_key!r} {tuple(action.shape)} among "
+                f"{sorted(map(str, tensordict.keys(True, True)))}. "
+                "For the recorded data of a replay buffer, make a transform with forward_only=True."
+            )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self.context_keys and not self.reads_early:

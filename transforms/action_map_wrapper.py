@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +44,16 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
             those that the map was trained on. A nested key stands in a list, ``[("arm", "joint_angle")]``.
         action_scale: what 1 stands for, in the map's own units, in place of the map's.
         saturation: ``"scale"`` or ``"clip"``, what happens at the limits, in place of the map's.
+        allow: modules that may be imported for the class of a map in a file, see ``nht.load_map``.
 
     Raises:
         TypeError: if ``env`` or ``map`` is none, or on actions or, here or at the first reset, a context entry that is
             not of floats.
         FileNotFoundError: if there is no such file of a map.
-        ValueError: on an ``action_scale`` that is not positive and finite, on another ``saturation``, on context keys
-            that are missing or in another order than the map's; if the width of the actuation or, here or at the first
-            reset, of the context is not the map's; at a step, on an action of another shape.
+        ValueError: on a file that is none of a map, on an ``action_scale`` that is not positive and finite, on another
+            ``saturation``, on context keys that are missing or in another order than the map's; if the width of the
+            actuation or, here or at the first reset, of the context is not the map's; at a step, on an action of
+            another shape.
         KeyError: at a reset or step that brings a context key neither in the observation nor in ``info``.
         ResetNeeded: at a step before the first reset.
     """
@@ -64,13 +66,14 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
         *,
         action_scale: float | None = None,
         saturation: Saturation | None = None,
+        allow: Sequence[str] = (),
     ) -> None:
         if not isinstance(env, gymnasium.Env):
             raise TypeError(
                 f"env must be a gymnasium.Env, got {type(env).__name__}: "
                 "ActionMapVectorWrapper is for vector environments."
             )
-        taken = take_map(map, action_scale, saturation)
+        taken = take_map(map, action_scale, saturation, allow)
         self._map_has_a_file = isinstance(map, str | Path)
         RecordConstructorArgs.__init__(
             self,
@@ -78,6 +81,7 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
             context_keys=_as_json(context_keys),
             action_scale=None if action_scale is None else float(action_scale),
             saturation=saturation,
+            allow=list(allow),
         )
         super().__init__(env)
         self._mapping = GymnasiumMapping(taken, context_keys, env.observation_space, env.action_space)
@@ -128,7 +132,7 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
     """``ActionMapWrapper`` around a ``gymnasium.vector.VectorEnv``: actions are (N, k), actuations (N, n).
 
     ``infos["actuation"]`` is what the copies executed; where a copy was reset instead, it is 0 and its mask,
-    ``infos["_actuation"]``, False. In the autoreset mode ``SAME_STEP`` it stands beside ``final_info``, not within.
+    ``infos["_actuation"]``, False. In the autoreset mode ``SAME_STEP`` it stands beside ``final_info`` and within.
 
     Arguments, and errors beside those of ``ActionMapWrapper``, are the same.
 
@@ -147,9 +151,10 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
         *,
         action_scale: float | None = None,
         saturation: Saturation | None = None,
+        allow: Sequence[str] = (),
     ) -> None:
         super().__init__(env)
-        taken = take_map(map, action_scale, saturation)
+        taken = take_map(map, action_scale, saturation, allow)
         self._mapping = GymnasiumMapping(
             taken, context_keys, env.observation_space, env.action_space, (env.num_envs,)
         )
@@ -190,6 +195,14 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
         actuation[self._waiting] = 0.0
         self._waiting = (terminations | truncations) & self._skips_a_step
         infos = infos | {"actuation": actuation, "_actuation": executed}
+        if isinstance(
+            final := infos.get("final_info"), Mapping
+        ):  # where the last steps of episodes are looked up
+            infos["final_info"] = {
+                **final,
+                "actuation": actuation.copy(),
+                "_actuation": terminations | truncations,
+            }
         return observations, rewards, terminations, truncations, infos
 
 

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.data.tensor_specs import Stacked
-from torchrl.envs.transforms import Transform
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import RewardSum, StepCounter, Transform
+
+STATE_ONLY = (RewardSum, StepCounter)
+"""Transforms that add to the input, but leave actions alone. For that they ask the chain ahead of them for its specs,
+which an ObservationNorm without statistics cannot tell yet."""
 
 
-def transformed_spec(
-    spec: Composite, ahead: Sequence[Transform], kind: Literal["input", "output"]
-) -> Composite:
-    """The environment's input or output spec, as the transforms ahead leave it."""
-    spec = spec.clone()
+def transformed_action_spec(base: EnvBase, ahead: Sequence[Transform]) -> Composite:
+    """The environment's actions, as the transforms ahead leave them."""
+    spec = base.input_spec.clone()
     for transform in ahead:
-        change = transform.transform_input_spec if kind == "input" else transform.transform_output_spec
-        spec = change(spec)
-    return spec
+        if not isinstance(transform, STATE_ONLY):
+            spec = transform.transform_input_spec(spec)
+    return spec["full_action_spec"]
+
+
+def transformed_observation_spec(base: EnvBase, ahead: Sequence[Transform]) -> Composite:
+    """What the environment observes, as the transforms ahead leave it."""
+    spec = base.output_spec.clone()
+    for transform in ahead:
+        spec = transform.transform_output_spec(spec)
+    return spec["full_observation_spec"]
 
 
 def find_actuation_spec(action_spec: Composite, key: NestedKey, actuation_dim: int) -> TensorSpec:

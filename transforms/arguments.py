@@ -16,7 +16,10 @@ MapOrFile = ActionMap | str | Path
 
 
 def take_map(
-    map: MapOrFile, action_scale: float | Tensor | None = None, saturation: Saturation | None = None
+    map: MapOrFile,
+    action_scale: float | Tensor | None = None,
+    saturation: Saturation | None = None,
+    allow: Sequence[str] = (),
 ) -> ActionMap:
     """A map of one's own, from a map or its file: frozen and in eval mode, with scale and saturation laid over.
 
@@ -24,14 +27,16 @@ def take_map(
         map: a map, of which this is a copy, or the path of a file of ``nht.save_map``.
         action_scale: what a policy's action of 1 stands for, in the map's own units. None leaves the map's.
         saturation: ``"scale"`` or ``"clip"``. None leaves the map's.
+        allow: modules that may be imported for the class of a map in a file, see ``nht.load_map``.
 
     Raises:
         TypeError: if ``map`` is neither.
         FileNotFoundError: if there is no such file.
-        ValueError: if the action scale, given or the map's own, is not positive and finite; on another saturation.
+        ValueError: if the file is none of a map; if the action scale, given or the map's own, is not positive and
+            finite; on another saturation.
     """
     if isinstance(map, str | Path):
-        taken = load_map(map)
+        taken = load_map(map, allow=allow)
     elif isinstance(map, ActionMap):
         taken = copy.deepcopy(map)
     else:

@@ -12,12 +12,16 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from nht import ActionMap
-from nht.transforms.action_spec import find_actuation_spec, limits, transformed_spec
+from nht.transforms.action_spec import (
+    find_actuation_spec,
+    limits,
+    transformed_action_spec,
+    transformed_observation_spec,
+)
 from nht.transforms.context import check_context, check_writers, read_context
 from nht.transforms.torchrl_internals import (
     EarlyReader,
     completes_the_environment,
-    containers,
     leaves,
     let_read_early,
     surroundings,
@@ -110,15 +114,15 @@ class Attachment(EarlyReader):
             spec[self.context_key] = Unbounded(self._context_shape, dtype=self.dtype, device=spec.device)
         return spec
 
+    def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """TorchRL calls this before a reset, as it calls ``inv`` before a step."""
+        self._check_place()
+        return super()._reset_env_preprocess(tensordict)
+
     def _check_place(self) -> None:
-        """What holds for all steps is up to date, and nobody takes this for a replay buffer's transform."""
+        """Looks around again, if the chain has changed since. To be called before the environment is."""
         if not self._is_current:
             self._attach()
-        if self._low is None and any(True for _ in containers(self)):
-            raise ValueError(
-                "this ActionMapTransform is in a chain without an environment, such as that of a replay buffer, "
-                "where inv would map recorded actions: make one with forward_only=True."
-            )
 
     def _attach(self) -> None:
         """Checks map against environment, if there is one by now, and reads what holds for all steps."""
@@ -138,7 +142,7 @@ class Attachment(EarlyReader):
             self._attach_context(env.base_env, chain, ahead, made=set(self.context_keys) - raw_keys)
 
     def _attach_actuation(self, base: EnvBase, ahead: list[Transform]) -> None:
-        action_spec = transformed_spec(base.input_spec, ahead, "input")["full_action_spec"]
+        action_spec = transformed_action_spec(base, ahead)
         spec = find_actuation_spec(action_spec, self.actuation_key, self.map.actuation_dim)
         batch_dims = len(base.batch_size)
         self._low, self._high = limits(spec, batch_dims)
@@ -154,7 +158,7 @@ class Attachment(EarlyReader):
         observation_spec = base.full_observation_spec
         if made and ahead:
             check_writers(ahead, self.context_keys, made)
-            observation_spec = transformed_spec(base.output_spec, ahead, "output")["full_observation_spec"]
+            observation_spec = transformed_observation_spec(base, ahead)
         check_context(observation_spec, self.context_keys, self._context_shape[:-1], self.map.context_dim)
         self.reads_early = not made and not all(map(completes_the_environment, ahead))
         if self.reads_early and chain is not None:
