@@ -19,8 +19,7 @@ from taking_turns import commit
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from nht.recipes.agents.losses import PaperDDPGLoss
-from nht.recipes.agents.networks import ddpg_networks
+from nht.recipes.agents.ddpg import PaperDDPGLoss, networks
 from nht.recipes.config import DDPG
 from nht.recipes.launch import configure
 from nht.recipes.run.checkpoints import Checkpoints
@@ -33,7 +32,7 @@ def benchmark(saves: int) -> None:
     """Fill the buffer, then save again and again."""
     config = configure(DDPG, "ddpg")
     env = base_env(config.env, seed=0, num_envs=1)
-    features, actor, critic = ddpg_networks(env, config.algo)
+    features, actor, critic = networks(env, config.algo)
     loss = PaperDDPGLoss(actor, critic, gamma=0.98, action_l2=0.05)
     optimiser = torch.optim.Adam(loss.parameters())
     for parameter in loss.parameters():

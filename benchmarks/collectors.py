@@ -23,11 +23,12 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import BaseCollector
 
 import nht
-from nht.recipes.agents.networks import ppo_networks
-from nht.recipes.config import PPO, CollectorConfig
+from nht.recipes.agents.ppo import networks
+from nht.recipes.config import PPO
 from nht.recipes.launch import configure
 from nht.recipes.run.collecting import make_collector
 from nht.recipes.run.environments import base_env, mapped_env
+from nht.recipes.sections import CollectorConfig
 
 TASKS = {
     "half_cheetah": ["env=half_cheetah", "env.num_envs=64"],
@@ -94,7 +95,7 @@ def collector(config: PPO, map: nht.ActionMap, kind: str, workers: int) -> BaseC
     """A collector of the recipe, as the recipe makes it."""
     make_env = partial(mapped_env, config.env, map, 1.0, num_envs=config.env.num_envs // workers)
     env = make_env(seed=0)
-    features, actor, _ = ppo_networks(env, config.algo)
+    features, actor, _ = networks(env, config.algo)
     # A batch that is ready first is of one worker: half as many steps.
     share = workers if kind == "multi_async" else 1
     return make_collector(

@@ -21,9 +21,9 @@ import torch
 
 import nht
 from nht.envs import make_expert, make_task
-from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
 from nht.recipes.data.recording import record_expert
-from nht.recipes.train_map import make_map
+from nht.recipes.maps.kinds import make_map
+from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 
 CONTEXT = ["tool_position", "joint_angle"]
 EPISODES = 1_000

@@ -21,9 +21,9 @@ from omegaconf import OmegaConf
 
 import nht
 from nht.envs import make_task
-from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
 from nht.recipes.data.recording import record_expert
-from nht.recipes.train_map import make_map
+from nht.recipes.maps.kinds import make_map
+from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 
 ACTION_DIMS = {"wam_grasp": 3, "wam_wipe": 2}
 SCALES = (0.5, 1.0, 2.0)  # actuation [rad/s] per unit of action

@@ -20,9 +20,9 @@ import torch
 from tensordict import TensorDict
 
 import nht
-from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
 from nht.recipes.data.recording import record_expert
-from nht.recipes.train_map import train_map
+from nht.recipes.maps.interface import train_map
+from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.train import _gradient_steps
 
 TRANSITIONS = 100_000

@@ -42,7 +42,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import nht.envs
-from nht.recipes.agents.networks import orthogonal
+from nht.recipes.agents.ppo import orthogonal
 from nht.recipes.config import PPO
 from nht.recipes.launch import configure
 from nht.recipes.ppo import main

@@ -23,10 +23,10 @@ import pandas
 import torch
 
 import nht
-from nht.recipes.config import DemosConfig, EnvConfig, MapConfig
 from nht.recipes.data.recording import record_expert
+from nht.recipes.maps.interface import train_map
 from nht.recipes.run.environments import mapped_env
-from nht.recipes.train_map import train_map
+from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 
 ENV = EnvConfig(context_keys=["tool_position", "joint_angle"])
 LARGE = 10.0  # a basis this long turns an action of 0.2 into the joints' largest speed
@@ -65,7 +65,8 @@ def measured(
         map, metrics = train_map(config, ENV, demos, seed)
     except FloatingPointError:
         return row | {"error": math.inf, "norm_demos": math.inf}
-    env = mapped_env(ENV, map, config.action_scale, seed=seed, num_envs=10)
+    map.action_scale.fill_(config.action_scale)
+    env = mapped_env(ENV, map, seed=seed, num_envs=10)
     env.set_seed(seed)
     steps = env.rollout(200, break_when_any_done=False)
     actuation, limit = steps["next", "actuation"], env.base_env.action_spec.space.high[:1]

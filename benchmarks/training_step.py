@@ -25,8 +25,9 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import nht
-from nht.recipes.agents.losses import JointSoftUpdate, PaperDDPGLoss, n_step_returns
-from nht.recipes.agents.networks import ddpg_networks, exploring
+from nht.recipes.agents.ddpg import PaperDDPGLoss, networks
+from nht.recipes.agents.off_policy import JointSoftUpdate, exploring
+from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.config import DDPG
 from nht.recipes.ddpg import STORED, main
 from nht.recipes.launch import configure
@@ -39,8 +40,8 @@ SHORT, LONG = 2_000, 6_000  # frames
 def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
     """Every part of a round, ready to be called again and again."""
     algo = config.algo
-    env = mapped_env(config.env, map, config.map.action_scale, seed=0)
-    features, actor, critic = ddpg_networks(env, algo)
+    env = mapped_env(config.env, map, seed=0)
+    features, actor, critic = networks(env, algo)
     loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2)
     target = JointSoftUpdate(loss, eps=algo.polyak)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-6, fused=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from nht.envs.arm import Arm
 from nht.envs.gymnasium_ids import gymnasium_id, register
-from nht.envs.registry import FOREIGN, TASKS, Arm, TaskRecord, make_env, make_expert, make_task
+from nht.envs.registry import FOREIGN, TASKS, TaskRecord, make_env, make_expert, make_task
 
 if TYPE_CHECKING:
     from nht.envs.dm_control import make_dm_control

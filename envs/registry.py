@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nht.envs.arm import Arm
 from nht.envs.table import Table, imported
 
 if TYPE_CHECKING:
@@ -18,21 +19,6 @@ if TYPE_CHECKING:
     from nht.envs.task import BatchedTask
 
 GOLDEN = Path(__file__).parent / "assets" / "golden"
-
-
-@dataclass(frozen=True)
-class Arm:
-    """A serial arm with revolute joints: Denavit-Hartenberg parameters, joint by joint, in the standard convention.
-
-    Attributes:
-        lengths: a [m].
-        twists: alpha [rad].
-        offsets: d [m]; the last one reaches to the tool.
-    """
-
-    lengths: tuple[float, ...]
-    twists: tuple[float, ...]
-    offsets: tuple[float, ...]
 
 
 @dataclass(frozen=True)

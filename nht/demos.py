@@ -1,30 +1,46 @@
-"""Demonstrations: whole episodes in a TorchRL replay buffer on memory-mapped storage, beside a manifest.
+"""Demonstrations: whole episodes in a TorchRL replay buffer, beside a manifest.
 
 On disk it is a folder: `manifest.json` says what was recorded, by whom and with which versions, and has a
-fingerprint of the data; `data/` has one raw file per key. Nothing is pickled, and a folder is complete or not
-there at all.
+fingerprint of the data; `data/` has one raw file per key, mapped into memory when it is read. Nothing is pickled, and
+a folder is complete or not there at all.
 """
 
 import hashlib
 import json
-import os
-import shutil
-import uuid
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import torch
+from numpy.typing import ArrayLike
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, LazyMemmapStorage, ReplayBuffer
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorStorage
 
+from nht.arrays import as_tensor
 from nht.episodes import check, items, key_name, listed, whole_episodes
+from nht.memmap import STORAGE, raw, read_tensordict, write_tensordict
+from nht.reading import checksum, entry, known_entries, read_json, shortened
+from nht.scratch import check_room, publish, scratch
 
 FORMAT = "nht.demos"
 FORMAT_VERSION = 1
 PACKAGES = ("nht", "torch", "torchrl", "tensordict", "numpy", "mujoco")  # whose versions the manifest records
+ENTRIES: dict[str, type | tuple[type, ...]] = {
+    "format": str,
+    "format_version": int,
+    "env": str,
+    "seed": (int, type(None)),
+    "expert": str,
+    "settings": dict,
+    "episodes": int,
+    "transitions": int,
+    "keys": dict,
+    "versions": dict,
+    "fingerprint": str,
+}
+"""Of a manifest; `checksum`, over all of these, is missing in those of earlier versions."""
 
 
 class Demos:
@@ -44,13 +60,13 @@ class Demos:
     def from_tensors(
         cls,
         *,
-        actuation: Tensor,
-        episode: Tensor,
-        context: Tensor | Mapping[str, Tensor],
-        next_context: Tensor | Mapping[str, Tensor] | None = None,
+        actuation: Tensor | ArrayLike,
+        episode: Tensor | ArrayLike,
+        context: Tensor | ArrayLike | Mapping[str, Tensor | ArrayLike],
+        next_context: Tensor | ArrayLike | Mapping[str, Tensor | ArrayLike] | None = None,
         env: str = "unknown",
     ) -> "Demos":
-        """Demonstrations from tensors of your own, in temporary memory-mapped files.
+        """Demonstrations from tensors or NumPy arrays of your own, copied into memory.
 
         Args:
             actuation: (T, n), in order of time.
@@ -62,12 +78,12 @@ class Demos:
         Raises:
             ValueError: on data that are no whole, finite demonstrations.
         """
-        entries: dict[str, Any] = dict(context) if isinstance(context, Mapping) else {"context": context}
+        entries: dict[str, Any] = _named(context, "context")
         if next_context is not None:
-            given = isinstance(next_context, Mapping)
-            entries["next"] = dict(next_context) if given else {"context": next_context}
-        entries |= {"actuation": actuation, "episode": episode.long()}
-        return cls.from_episodes(TensorDict(entries, batch_size=actuation.shape[:1]), env=env)
+            entries["next"] = _named(next_context, "next_context")
+        entries["actuation"] = motors = as_tensor(actuation, "actuation")
+        entries["episode"] = as_tensor(episode, "episode").long()
+        return cls.from_episodes(TensorDict(entries, batch_size=motors.shape[:1]), env=env)
 
     @classmethod
     def from_tensordict(
@@ -117,14 +133,14 @@ class Demos:
         expert: str = "unknown",
         settings: Mapping[str, Any] | None = None,
     ) -> "Demos":
-        """Demonstrations from a TensorDict as `save_demos` takes it, in temporary memory-mapped files.
+        """Demonstrations from a TensorDict as `save_demos` takes it, copied into memory.
 
         Raises:
             KeyError: if "actuation" or "episode" is missing.
             ValueError: on data that are no whole, finite demonstrations.
         """
         manifest = _manifest(data, env=env, seed=None, expert=expert, settings=dict(settings or {}))
-        return cls(_buffer(data, None), manifest)
+        return cls(_buffer(data.cpu().clone()), manifest)
 
     @property
     def data(self) -> TensorDictBase:
@@ -149,6 +165,14 @@ class Demos:
     def __len__(self) -> int:
         return len(self.buffer)
 
+    def __repr__(self) -> str:
+        about = self.manifest
+        keys = ", ".join(f"{key} {tuple(value['shape'])}" for key, value in about["keys"].items())
+        return (
+            f"Demos({len(self):,} transitions in {about['episodes']:,} episodes, env={about['env']!r}, "
+            f"expert={about['expert']!r}, keys: {shortened(keys, 400)})"
+        )
+
     def context(self, keys: Sequence[NestedKey]) -> Tensor:
         """The entries of `keys` side by side, (T, context_dim); no keys give (T, 0).
 
@@ -169,12 +193,12 @@ class Demos:
 
 
 def save_demos(
-    data: TensorDictBase,
+    data: TensorDictBase | Demos,
     path: str | Path,
     *,
-    env: str,
-    seed: int | None,
-    expert: str,
+    env: str | None = None,
+    seed: int | None = None,
+    expert: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Demos:
     """Writes demonstrations to a new folder, all or nothing.
@@ -182,7 +206,8 @@ def save_demos(
     Args:
         data: (T,) transitions in order of time: "actuation" (T, n), "episode" (T,) int64, and every raw key
             that may serve as context, (T, width). More keys are welcome: "reward", flags, ("next", key). If
-            there is "done" (T, 1), the last transition of every episode must have it set.
+            there is "done" (T, 1), the last transition of every episode must have it set. Or `Demos`, whose
+            manifest says what is not given here.
         path: a folder that does not exist yet.
         env: name of the env.
         seed: what the collection was seeded with, if it was.
@@ -192,21 +217,32 @@ def save_demos(
     Raises:
         FileExistsError: if `path` exists: demonstrations are never overwritten.
         KeyError: if "actuation" or "episode" is missing.
+        OSError: if there is no room.
         ValueError: on data that are no whole, finite demonstrations.
     """
     path = Path(path)
     if path.exists():
         raise FileExistsError(f"{path} exists, and demonstrations are never overwritten: choose another path")
-    manifest = _manifest(data, env=env, seed=seed, expert=expert, settings=dict(settings or {}))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        scratch.mkdir()
-        _buffer(data, scratch / "data").storage.dumps(scratch / "data")
-        (scratch / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
-        os.rename(scratch, path)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+    about = data.manifest if isinstance(data, Demos) else {}
+    data = data.data if isinstance(data, Demos) else data
+    manifest = _manifest(
+        data,
+        env=about.get("env", "unknown") if env is None else env,
+        seed=about.get("seed") if seed is None else seed,
+        expert=about.get("expert", "unknown") if expert is None else expert,
+        settings=dict(about.get("settings", {}) if settings is None else settings),
+    )
+    manifest = json.loads(json.dumps(manifest))  # as it will be read
+    text = json.dumps(manifest | {"checksum": checksum(manifest)}, indent=2) + "\n"
+    size = sum(value.numel() * value.element_size() for _, value in items(data))
+    check_room(path.parent, size, f"saving demonstrations in {path}")
+    with scratch(path) as place:
+        write_tensordict(data, place / "data")
+        (place / "data" / STORAGE).write_text(
+            json.dumps({"metadata": {}, "is_pytree": False, "len": len(data)})
+        )
+        (place / "manifest.json").write_text(text)
+        publish(place, path)
     return load_demos(path)
 
 
@@ -226,42 +262,51 @@ def load_demos(path: str | Path, *, env: str | None = None) -> Demos:
     if env is not None and manifest["env"] != env:
         raise ValueError(f"{path} holds demonstrations of env {manifest['env']!r}, expected {env!r}")
     try:
-        data = TensorDict.load_memmap(path / "data", allow_pickle=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        data = read_tensordict(path / "data")
+    except (OSError, ValueError) as error:
         raise ValueError(f"the data of {path} cannot be read: {error}") from error
-    if _fingerprint(data) != manifest["fingerprint"]:
+    if _described(data) != {name: manifest[name] for name in _described(data)}:
         raise ValueError(f"the data of {path} are not those of its manifest: they were changed or cut short")
-    storage = LazyMemmapStorage(len(data), scratch_dir=path / "data", existsok=True)
-    storage.loads(path / "data")  # from its own folder: maps the files, copies nothing
-    return Demos(ReplayBuffer(storage=storage, writer=ImmutableDatasetWriter()), manifest)
+    return Demos(_buffer(data), manifest)
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        manifest = json.loads((path / "manifest.json").read_text())
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"{path} holds no demonstrations: there is no manifest.json in it") from None
-    except ValueError as error:
-        raise ValueError(f"{path / 'manifest.json'} is not JSON: {error}") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+    file = path / "manifest.json"
+    if not file.is_file():
+        raise FileNotFoundError(f"{path} holds no demonstrations: there is no manifest.json in it")
+    manifest = read_json(file)
+    if manifest.get("format") != FORMAT:
         raise ValueError(f"{path} holds no demonstrations: its manifest.json is not marked {FORMAT!r}")
-    found = manifest.get("format_version")
+    found = entry(manifest, "format_version", int, str(file))
     if found != FORMAT_VERSION:
         raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}")
+    for name, kind in ENTRIES.items():
+        entry(manifest, name, kind, str(file))
+    known_entries(manifest, [*ENTRIES, "checksum"], str(file))
+    expected = manifest.pop("checksum", None)
+    if expected is not None and checksum(manifest) != expected:
+        raise ValueError(
+            f"{file} was changed since it was written: its checksum is that of another manifest."
+        )
     return manifest
 
 
-def _buffer(data: TensorDictBase, folder: Path | None) -> ReplayBuffer:
-    """A buffer that holds `data` in a folder, or in temporary files, and takes no more."""
-    storage = LazyMemmapStorage(len(data), scratch_dir=folder)
-    ReplayBuffer(storage=storage).extend(data.cpu())
-    return ReplayBuffer(storage=storage, writer=ImmutableDatasetWriter())
+def _buffer(data: TensorDictBase) -> ReplayBuffer:
+    """A buffer over `data`, not copied, that takes no more."""
+    return ReplayBuffer(storage=TensorStorage(data), writer=ImmutableDatasetWriter())
+
+
+def _named(values: Any, name: str) -> dict[str, Tensor]:
+    """Arrays by key, those of a context; a single one stands under "context"."""
+    given = values if isinstance(values, Mapping) else {"context": values}
+    return {key: as_tensor(value, f"{name}, key {key!r}") for key, value in given.items()}
 
 
 def _manifest(
     data: TensorDictBase, *, env: str, seed: int | None, expert: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
     check(data)
+    described = _described(data)
     return {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -269,13 +314,20 @@ def _manifest(
         "seed": seed,
         "expert": expert,
         "settings": settings,
+        **described,
+        "versions": _versions(),
+    }
+
+
+def _described(data: TensorDictBase) -> dict[str, Any]:
+    """What a manifest says of the data themselves."""
+    return {
         "episodes": len(torch.unique(data["episode"])),
         "transitions": len(data),
         "keys": {
             key_name(key): {"shape": list(value.shape[1:]), "dtype": str(value.dtype)}
             for key, value in items(data)
         },
-        "versions": _versions(),
         "fingerprint": _fingerprint(data),
     }
 
@@ -284,7 +336,7 @@ def _fingerprint(data: TensorDictBase) -> str:
     digest = hashlib.sha256()
     for key, value in items(data):
         digest.update(f"{key_name(key)} {value.dtype} {tuple(value.shape)};".encode())
-        digest.update(value.cpu().contiguous().flatten().view(torch.uint8).numpy().data)
+        digest.update(raw(value))
     return digest.hexdigest()
 
 

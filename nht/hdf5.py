@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType, ModuleType
-from typing import Any
+from types import MappingProxyType
 
-import torch
 from tensordict import TensorDict
 
+from nht.arrays import as_tensor
 from nht.demos import Demos
 from nht.episodes import whole_episodes
+from nht.hdf5_file import import_h5py, names, opened, read
+from nht.reading import shown
 
 D4RL_CONTEXT: Mapping[str, str] = MappingProxyType({"observation": "observations"})
 OUTCOMES = {"reward": "rewards", "terminated": "terminals", "truncated": "timeouts"}  # ours: D4RL's, optional
+LISTED = 200  # keys that a message looks at, of which it shows some
+ROBOMIMIC = (
+    "Its layout is robomimic's: a group data/demo_N for every demonstration, which is not read. Put their arrays one "
+    "after another and mark the last step of each, with h5py, or hand them to nht.Demos.from_tensors."
+)
 
 
 def from_hdf5(
@@ -30,7 +36,8 @@ def from_hdf5(
 
     Rewards, terminals and timeouts are taken along where the file has them, as is "next_observations" beside
     "observations". Files without it give demonstrations without "next", for what followed an episode's last
-    step is not in them. Episodes that do not end are left out, and counted in the manifest.
+    step is not in them. Episodes that do not end are left out, and counted in the manifest. Links within the file are
+    followed; links, storage and virtual data sets that name other files are refused.
 
     Args:
         path: the file.
@@ -44,8 +51,8 @@ def from_hdf5(
         ImportError: without the extra.
         FileNotFoundError: if there is no such file.
         KeyError: on a key that is not in the file; the message lists those that are.
-        ValueError: on a file that cannot be read or is cut short, on arrays of different lengths, on values that
-            are no finite demonstrations, and if no episode ends.
+        ValueError: on a file that cannot be read, is cut short or names other files, on arrays that hold no numbers
+            or are of different lengths, on values that are no finite demonstrations, and if no episode ends.
     """
     data, left_out = hdf5_episodes(
         path, actuation_key=actuation_key, context=context, episode_key=episode_key, done_key=done_key
@@ -62,16 +69,16 @@ def hdf5_episodes(
     done_key: str | None = None,
 ) -> tuple[TensorDict, int]:
     """What `from_hdf5` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
-    names = context if isinstance(context, Mapping) else {key: key for key in context}
+    sources = context if isinstance(context, Mapping) else {key: key for key in context}
     needed: dict[tuple[str, ...], str] = {("actuation",): actuation_key}
-    needed |= {("context", name): key for name, key in names.items()}
+    needed |= {("context", name): key for name, key in sources.items()}
     needed |= {(name,): key for name, key in (("number", episode_key), ("end", done_key)) if key is not None}
     optional: dict[tuple[str, ...], str] = {("next", name): key for name, key in OUTCOMES.items()}
-    optional |= {("next", "context", name): f"next_{key}" for name, key in names.items()}
+    optional |= {("next", "context", name): f"next_{key}" for name, key in sources.items()}
     return whole_episodes(
         _read(Path(path), needed, optional),
         actuation_key="actuation",
-        context={tuple(name.split("/")): ("context", name) for name in names},
+        context={tuple(name.split("/")): ("context", name) for name in sources},
         episode_key=None if episode_key is None else "number",
         done_key=None if done_key is None else "end",
     )
@@ -79,31 +86,24 @@ def hdf5_episodes(
 
 def _read(path: Path, needed: dict[tuple[str, ...], str], optional: dict[tuple[str, ...], str]) -> TensorDict:
     """The arrays of the file by our keys."""
-    h5py = _import_h5py()
+    import_h5py()
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
-    try:
-        with h5py.File(path, "r") as file:
-            found: list[str] = []
-            file.visititems(
-                lambda name, entry: found.append(name) if isinstance(entry, h5py.Dataset) else None
-            )
-            if missing := set(needed.values()) - set(found):
-                raise KeyError(f"keys {sorted(missing)} are not in {path}, which has {found}")
-            wanted = needed | {key: name for key, name in optional.items() if name in found}
-            arrays: dict[str, Any] = {name: file[name][()] for name in set(wanted.values())}
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read, it is cut short or no HDF5 file: {error}") from error
-    lengths = {name: len(array) if array.ndim else 0 for name, array in arrays.items()}
+    wanted = {**needed, **optional}
+    with opened(path) as file:
+        arrays = {name: read(file, name) for name in sorted(set(wanted.values()))}
+        missing = sorted(name for name in set(needed.values()) if arrays[name] is None)
+        present = names(file, LISTED) if missing else []
+    robomimic = any(name.startswith("data/demo_") for name in present)
+    if missing:
+        hint = f" {ROBOMIMIC}" if robomimic else ""
+        raise KeyError(f"keys {shown(missing)} are not in {path}, which has {shown(present)}.{hint}")
+    rows = {
+        key: as_tensor(array, f"{path}: {name!r}")
+        for key, name in wanted.items()
+        if (array := arrays[name]) is not None
+    }
+    lengths = {wanted[key]: len(tensor) if tensor.ndim else 0 for key, tensor in rows.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"the arrays of {path} must have a row per transition each, got lengths {lengths}")
-    rows = {key: torch.from_numpy(arrays[name]) for key, name in wanted.items()}
     return TensorDict(rows, batch_size=list(lengths.values())[:1])
-
-
-def _import_h5py() -> ModuleType:
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError("HDF5 files need an optional package: pip install 'nht[minari]'") from error
-    return h5py

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -14,15 +15,36 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
+from nht.arrays import as_tensor
 from nht.demos import Demos
 from nht.episodes import FLAGS, items, key_name, whole_episodes
+from nht.minari_file import (
+    METADATA,
+    check_dataset,
+    datasets_root,
+    leaves_that_are_no_arrays,
+    local_datasets,
+)
+from nht.reading import shortened, shown
+from nht.scratch import check_room, publish, scratch
 
 if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset
     from minari.data_collector import EpisodeBuffer
 
 Array = NDArray[Any]
-UNREADABLE = (OSError, ValueError, KeyError, AssertionError, RuntimeError)  # what minari and h5py raise
+# What minari, gymnasium and h5py raise on files that are damaged.
+UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    AssertionError,
+    RuntimeError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    MemoryError,
+)
 
 
 def from_minari(
@@ -34,10 +56,12 @@ def from_minari(
     """Demonstrations from a local Minari dataset; those of its episodes that do not end are left out.
 
     Args:
-        dataset: a dataset, the id of a local one, a dataset's folder or the HDF5 file in it.
-        context: which entries may serve as context, or such entries by the names they get: "observation", or
-            the entries of a Dict space by their own names; "infos/qpos" and the like. By default all
-            observations. Text is no context.
+        dataset: the id of a local dataset, a dataset's folder or the HDF5 file in it. Opening it runs nothing. Or
+            a dataset that you opened yourself, whatever Minari ran for that.
+        context: which entries may serve as context, or such entries by the names they get: "observation",
+            the entries of a Dict space by their own names, those of a Tuple as "observation/0"; "infos/qpos" and
+            the like. By default all observations that are arrays; others, such as text, are named in the
+            manifest's settings as "left_out_observations".
         env: id of the Gymnasium env that the dataset must be of, if that matters.
 
     Raises:
@@ -45,7 +69,8 @@ def from_minari(
         FileNotFoundError: on a dataset that is not here; the message lists those that are.
         KeyError: on an entry that it lacks; the message lists those that are there.
         ValueError: on a dataset of another env, one that cannot be read, is cut short or has other shapes than
-            its spaces say, and on values that are no finite demonstrations.
+            its spaces say, one that Minari would have to run code for or that names other files, and on values
+            that are no finite demonstrations.
     """
     opened = open_minari(dataset)
     found = opened.env_spec.id if opened.env_spec is not None else "unknown"
@@ -56,8 +81,18 @@ def from_minari(
         data,
         env=found,
         expert=opened.storage.metadata.get("algorithm_name", "unknown"),
-        settings={"minari_dataset": opened.id, "left_out_episodes": left_out},
+        settings={
+            "minari_dataset": opened.id,
+            "left_out_episodes": left_out,
+            **left_out_observations(opened, context),
+        },
     )
+
+
+def left_out_observations(dataset: MinariDataset, context: Any) -> dict[str, list[str]]:
+    """For a manifest's settings: which observations are no arrays, where all were asked for. Empty if all are."""
+    names = [] if context is not None else list(leaves_that_are_no_arrays(dataset.observation_space))
+    return {"left_out_observations": names} if names else {}
 
 
 def open_minari(dataset: MinariDataset | str | Path) -> MinariDataset:
@@ -65,18 +100,25 @@ def open_minari(dataset: MinariDataset | str | Path) -> MinariDataset:
     minari = _import_minari()
     if isinstance(dataset, minari.MinariDataset):
         return dataset
+    folder = _data_folder(dataset)
+    try:
+        check_dataset(folder)
+        return minari.MinariDataset(folder)
+    except UNREADABLE as error:
+        raise ValueError(f"the Minari dataset {dataset} cannot be read: {shortened(error, 600)}.") from error
+
+
+def _data_folder(dataset: str | Path) -> Path:
+    """Where the files of a dataset are, which is named by its id, its folder or the HDF5 file in it."""
     path = Path(dataset)
     folder = path.parent if path.is_file() else path
-    folders = [found for found in (folder, folder / "data") if (found / "metadata.json").is_file()]
-    try:
-        return minari.MinariDataset(folders[0]) if folders else minari.load_dataset(str(dataset))
-    except FileNotFoundError:
-        raise FileNotFoundError(
-            f"{dataset} is neither the folder of a Minari dataset, with a metadata.json, nor the id of a local one: "
-            f"there are {sorted(minari.list_local_datasets())}"
-        ) from None
-    except UNREADABLE as error:
-        raise ValueError(f"the Minari dataset {dataset} cannot be read: {error}") from error
+    for found in (folder, folder / "data", datasets_root() / str(dataset) / "data"):
+        if (found / METADATA).is_file():
+            return found
+    raise FileNotFoundError(
+        f"{dataset} is neither the folder of a Minari dataset, with a metadata.json, nor the id of a local one: "
+        f"there are {shown(local_datasets())}"
+    )
 
 
 def minari_episodes(
@@ -91,14 +133,15 @@ def minari_episodes(
             targets = {name: name for name in moments if not name.startswith("infos/")}
         if missing := set(targets.values()) - moments.keys():
             raise KeyError(
-                f"entries {sorted(missing)} are not in episode {episode.id} of {dataset.id}, which has {list(moments)}"
+                f"entries {sorted(missing)} are not in episode {episode.id} of {dataset.id}, which has {shown(moments)}"
             )
         parts.append(_transitions(episode, moments, set(targets.values())))
         lengths.append(len(episode))
     if targets is None or not sum(lengths):
         raise ValueError(f"the Minari dataset {dataset.id} has no transitions")
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    data = TensorDict({key: torch.from_numpy(column) for key, column in columns.items()}, [sum(lengths)])
+    rows = {key: as_tensor(column, f"{dataset.id}, {'/'.join(key)}") for key, column in columns.items()}
+    data = TensorDict(rows, [sum(lengths)])
     data["episode"] = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
     return whole_episodes(
         data, context={tuple(name.split("/")): ("context", key) for name, key in targets.items()}
@@ -110,7 +153,8 @@ def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:
         yield from dataset.iterate_episodes()
     except UNREADABLE as error:
         raise ValueError(
-            f"the Minari dataset {dataset.id} cannot be read, it may be cut short or of another env: {error}"
+            f"the Minari dataset {dataset.id} cannot be read, it may be cut short or of another env: "
+            f"{shortened(error, 600)}."
         ) from error
 
 
@@ -159,6 +203,9 @@ def _leaves(values: Any, space: Any, name: str) -> Iterator[tuple[str, Array, An
     if isinstance(values, dict):
         for key, value in values.items():
             yield from _leaves(value, space[key], key if name == "observation" else f"{name}/{key}")
+    elif isinstance(values, tuple):
+        for number, value in enumerate(values):
+            yield from _leaves(value, space[number], f"{name}/{number}")
     elif isinstance(values, np.ndarray):
         yield name, values, space
 
@@ -207,37 +254,53 @@ def to_minari(
     """
     minari = _import_minari()
     from minari.dataset.minari_dataset import parse_dataset_id
-    from minari.storage import get_dataset_path
 
     parse_dataset_id(dataset_id)
-    folder = get_dataset_path(dataset_id)
+    folder = datasets_root() / dataset_id
     if folder.exists():
         raise FileExistsError(f"the Minari dataset {dataset_id} exists: choose another name or version")
     if observation_keys is None and env is not None:
         observation_keys = ["observation"]
     buffers = _buffers(demos, observation_keys)
     spaces = _unbounded_spaces(buffers[0]) if env is None else {}
-    try:
-        with warnings.catch_warnings():  # on author and the like, which Minari recommends to name
-            warnings.simplefilter("ignore", UserWarning)
-            dataset = minari.create_dataset_from_buffers(
-                dataset_id,
-                buffers,
-                env=env,
-                algorithm_name=demos.manifest["expert"],
-                description=f"Demonstrations of {demos.manifest['env']}, fingerprint {demos.fingerprint}",
-                **spaces,
-            )
-        for episode in dataset.iterate_episodes():
-            _moments(dataset, episode)
-    except BaseException as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, UNREADABLE):
+    about = {
+        "algorithm_name": demos.manifest["expert"],
+        "description": f"Demonstrations of {demos.manifest['env']}, fingerprint {demos.fingerprint}",
+    }
+    size = sum(value.numel() * value.element_size() for _, value in items(demos.data))
+    check_room(folder.parent, 2 * size, f"writing the Minari dataset {dataset_id}")
+    with scratch(folder) as root:
+        try:
+            with (
+                _datasets_in(root),
+                warnings.catch_warnings(),
+            ):  # on author and the like, which Minari recommends
+                warnings.simplefilter("ignore", UserWarning)
+                dataset = minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **about, **spaces)
+            for episode in dataset.iterate_episodes():
+                _moments(dataset, episode)
+        except UNREADABLE as error:
             raise ValueError(
                 f"the demonstrations cannot be written as a dataset of env {env}: {error}"
             ) from error
-        raise
-    return dataset
+        publish(root / dataset_id, folder)
+        for about_namespace in root.rglob("namespace_metadata.json"):
+            if not (known := datasets_root() / about_namespace.relative_to(root)).exists():
+                publish(about_namespace, known)
+    return minari.MinariDataset(folder / "data")
+
+
+@contextmanager
+def _datasets_in(root: Path) -> Iterator[None]:
+    """Let Minari write below ``root``, which it only takes from the environment of the process."""
+    before = os.environ.get("MINARI_DATASETS_PATH")
+    os.environ["MINARI_DATASETS_PATH"] = str(root)
+    try:
+        yield
+    finally:
+        os.environ.pop("MINARI_DATASETS_PATH")
+        if before is not None:
+            os.environ["MINARI_DATASETS_PATH"] = before
 
 
 def _buffers(demos: Demos, observation_keys: Sequence[str] | None) -> list[EpisodeBuffer]:

@@ -9,6 +9,7 @@ python -m nht.recipes.collect_demos source=minari source.path=D4RL/door/human-v2
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -47,14 +48,19 @@ def _collect(config: CollectDemos) -> nht.Demos:
     if source.kind == "expert":
         return record_expert(config.env, config.demos, config.seed, config.out)
     if source.kind == "policy":
-        return record_policy(source.path, config.env, config.demos, config.seed, config.out)
+        return record_policy(source.path, config.env, config.demos, config.seed, config.out, source.allow)
     if source.kind in FILES:
         return import_demos(source, config.env, config.demos.min_return, config.out)
     raise ValueError(f"unknown source.kind {source.kind!r}: choose from {['expert', 'policy', *FILES]}.")
 
 
 def record_policy(
-    run: str | None, env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path
+    run: str | None,
+    env: EnvConfig,
+    demos: DemosConfig,
+    seed: int,
+    path: str | Path,
+    allow: Sequence[str] = (),
 ) -> nht.Demos:
     """Demonstrations of a finished run's policy, without exploration: what the motors got, through the run's map.
 
@@ -68,7 +74,7 @@ def record_policy(
     if run is None:
         raise ValueError("source=policy needs source.path: the folder of a finished run.")
     folder = Path(run)
-    trained = read_config(folder)
+    trained = read_config(folder, allow)
     if trained.env.name != env.name:
         raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
     options = trained.env.options | endings(env.name)
@@ -104,7 +110,7 @@ def import_demos(
         KeyError: for a key that the file lacks; the message lists those that are there.
         ValueError: if the file cannot be read, its values are not finite, or it does not fit the task.
     """
-    data, left_out, found, expert = read_episodes(source)
+    data, left_out, found, expert, notes = read_episodes(source)
     expected = source.env or env.name
     if found != "unknown" and _bare(found) != _bare(expected):
         raise ValueError(
@@ -114,7 +120,7 @@ def import_demos(
     if min_return is not None:
         data, worse = best_episodes(data, min_return)
         left_out += worse
-    settings = {"source": asdict(source), "min_return": min_return, "left_out_episodes": left_out}
+    settings = {"source": asdict(source), "min_return": min_return, "left_out_episodes": left_out, **notes}
     demos = nht.Demos.from_episodes(data, env=env.name, expert=expert, settings=settings)
     check_fits(demos, env, source.path or "")
     return nht.save_demos(demos.data, path, env=env.name, seed=None, expert=expert, settings=settings)

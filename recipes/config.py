@@ -85,6 +85,7 @@ class Evaluate:
     video: bool = True
     video_episodes: int = 6
     env_options: dict[str, Any] = field(default_factory=dict)  # laid over those of the run
+    allow: list[str] = field(default_factory=list)  # packages whose code a run's configuration may name
 
 
 @dataclass
@@ -151,6 +152,7 @@ class Report:
     out: str = path_field("")  # "" is a folder called report in the first of these
     title: str = ""
     metric: str = "success"  # or return: what the table and the curves show of every evaluation
+    allow: list[str] = field(default_factory=list)  # packages whose code a run's configuration may name
 
     def __post_init__(self) -> None:
         """Raise ValueError for a metric that evaluations do not have."""

@@ -22,7 +22,7 @@ from nht.recipes.run.video import record_video
 def main(config: Evaluate) -> None:
     """Test, film, and say how it went."""
     folder = Path(config.run)
-    trained = read_config(folder)
+    trained = read_config(folder, config.allow)
     env = lasting_failures(trained.env)
     env = replace(env, options=env.options | config.env_options)
     map = kept_map(folder, trained)

@@ -75,24 +75,26 @@ def _quoted(text: str) -> str:
 def _as_text(schema: type[Any], word: str) -> str:
     """An override with its value quoted if it is text, as titles and paths are: these may hold commas and the like."""
     key, equals, value = word.partition("=")
-    if not equals or _is_quoted(value) or value in ("null", "???"):
+    if not equals or _is_quoted(value):
         return word
-    return f"{key}={_quoted(value)}" if _is_text(schema, key.lstrip("+")) else word
+    kind = _type(schema, key.lstrip("+"))
+    is_text = kind == "str" or (kind == "str | None" and value != "null")
+    return f"{key}={_quoted(value)}" if is_text else word
 
 
 def _is_quoted(value: str) -> bool:
     return len(value) > 1 and value[0] == value[-1] and value[0] in ("'", '"')
 
 
-def _is_text(schema: type[Any], key: str) -> bool:
-    """Whether the field at a dotted name holds text."""
+def _type(schema: type[Any], key: str) -> str | None:
+    """The type of the field at a dotted name, as it is written there."""
     node: Any = schema
     *outer, last = key.split(".")
     for part in outer:
         node = next((_section(entry) for entry in fields(node) if entry.name == part), None)
         if node is None:
-            return False
-    return any(entry.name == last and str(entry.type) in ("str", "str | None") for entry in fields(node))
+            return None
+    return next((str(entry.type) for entry in fields(node) if entry.name == last), None)
 
 
 def _section(entry: Any) -> Any:

@@ -6,6 +6,7 @@ python -m nht.recipes.report runs/search-wam_wipe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -19,6 +20,7 @@ import pandas
 from nht.recipes.config import Report
 from nht.recipes.launch import launch
 from nht.recipes.run.folder import read_config
+from nht.recipes.run.metrics_file import metrics_table
 from nht.recipes.study.report import to_markdown, write_report
 from nht.recipes.study.scores import interquartile_mean, interval
 
@@ -49,7 +51,7 @@ def report_runs(config: Report) -> None:
         raise ValueError("name a folder of runs or of a search: report DIR, or report runs=[DIR, DIR].")
     out = Path(config.out or Path(folders[0]) / "report")
     out.mkdir(parents=True, exist_ok=True)
-    curves = read_runs([Path(folder) for folder in folders])
+    curves = read_runs([Path(folder) for folder in folders], config.allow)
     curves.to_csv(out / "curves.csv", index=False)
     table = summarise(curves, config.metric)
     (out / "table.md").write_text(to_markdown(table))
@@ -58,21 +60,26 @@ def report_runs(config: Report) -> None:
     print(f"\n{out}: curves.csv, table.md, {config.metric}.png")
 
 
-def read_runs(folders: list[Path]) -> pandas.DataFrame:
+def read_runs(folders: list[Path], allow: Sequence[str] = ()) -> pandas.DataFrame:
     """The evaluations of all runs in or below ``folders``, a row each, with the run's interface and seed.
+
+    Args:
+        folders: of runs.
+        allow: packages whose code their configurations may name.
 
     Raises:
         FileNotFoundError: if there is no run with an evaluation.
+        ValueError: if a run's files cannot be read.
     """
     metrics = sorted({path for folder in folders for path in folder.rglob("metrics.csv")})
     if not metrics:
         raise FileNotFoundError(f"no metrics.csv in or below {[str(folder) for folder in folders]}.")
-    return pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
+    return pandas.concat([_read_run(path, allow) for path in metrics], ignore_index=True)
 
 
-def _read_run(metrics: Path) -> pandas.DataFrame:
-    config = read_config(metrics.parent)
-    rows = pandas.read_csv(metrics)
+def _read_run(metrics: Path, allow: Sequence[str]) -> pandas.DataFrame:
+    config = read_config(metrics.parent, allow)
+    rows = metrics_table(metrics)
     interface = "raw" if config.map.kind == "none" else config.map.kind
     rows.insert(0, "interface", interface)
     rows.insert(1, "seed", config.seed)

@@ -51,6 +51,7 @@ class SourceConfig:
     context: dict[str, str] = field(default_factory=dict)  # {our name: its key there}; none: observations
     actuation_key: str | None = None  # hdf5, tensordict: None is "actions" and "action"
     episode_key: str | None = None  # hdf5, tensordict: integers that differ between episodes
+    allow: list[str] = field(default_factory=list)  # policy: packages whose code the run may name
     done_key: str | None = None  # hdf5, tensordict: true at an episode's last step; None takes the usual ones
 
 

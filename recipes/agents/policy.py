@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from safetensors.torch import load_file, save_file
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import EnvBase
 
+from nht.recipes.agents.policy_file import read_policy, write_policy
 from nht.recipes.agents.table import find_algorithm, name_of
 from nht.recipes.sections import Training
 
@@ -17,7 +17,7 @@ POLICY_FILE = "policy.safetensors"
 
 def save_policy(policy: nn.Module, folder: Path) -> None:
     """Write the deterministic policy, its normaliser included."""
-    save_file(policy.state_dict(), folder / POLICY_FILE)
+    write_policy(policy.state_dict(), folder / POLICY_FILE)
 
 
 def load_policy(folder: Path, env: EnvBase, config: Training) -> TensorDictModule:
@@ -30,8 +30,8 @@ def load_policy(folder: Path, env: EnvBase, config: Training) -> TensorDictModul
 
     Raises:
         FileNotFoundError: if the run has not finished.
-        RuntimeError: if the policy does not fit the environment.
+        ValueError: if the file is damaged or was changed, or the policy does not fit the environment.
     """
     policy = find_algorithm(name_of(type(config))).policy(env, config.algo)
-    policy.load_state_dict(load_file(folder / POLICY_FILE))
+    policy.load_state_dict(read_policy(folder / POLICY_FILE, policy.state_dict()))
     return policy

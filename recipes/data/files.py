@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 
 from nht.episodes import whole_episodes
 from nht.hdf5 import D4RL_CONTEXT, hdf5_episodes
-from nht.minari import minari_episodes, open_minari
+from nht.memmap import read_tensordict
+from nht.minari import left_out_observations, minari_episodes, open_minari
 from nht.recipes.sections import SourceConfig
 
 
@@ -23,6 +23,8 @@ class Episodes(NamedTuple):
     """Episodes that do not end."""
     env: str = "unknown"
     expert: str = "unknown"
+    notes: dict[str, list[str]] = {}  # noqa: RUF012 - never changed
+    """What else a manifest's settings should say."""
 
 
 def read_episodes(source: SourceConfig) -> Episodes:
@@ -63,25 +65,13 @@ def _read_minari(source: SourceConfig) -> Episodes:
     dataset = open_minari(source.path or "")
     data, left_out = minari_episodes(dataset, source.context or None)
     env = dataset.env_spec.id if dataset.env_spec is not None else "unknown"
-    return Episodes(data, left_out, env, dataset.storage.metadata.get("algorithm_name", "unknown"))
+    expert = dataset.storage.metadata.get("algorithm_name", "unknown")
+    return Episodes(data, left_out, env, expert, left_out_observations(dataset, source.context or None))
 
 
 def load_tensordict(path: str | Path) -> TensorDictBase:
-    """A TensorDict from its folder of memory-mapped files, or from that of a TorchRL storage. Nothing is unpickled.
-
-    Raises:
-        FileNotFoundError: if ``path`` is no such folder.
-        ValueError: if it cannot be read.
-    """
-    folder = Path(path)
-    if not (folder / "meta.json").is_file():
-        raise FileNotFoundError(f"{path} holds no TensorDict: there is no meta.json in it.")
-    try:
-        data = TensorDict.load_memmap(folder, allow_pickle=False)
-        storage = folder / "storage_metadata.json"  # a storage may have room for more than it holds
-        return data[: json.loads(storage.read_text())["len"]] if storage.exists() else data
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise ValueError(f"the TensorDict in {path} cannot be read: {error}") from error
+    """A TensorDict from its folder of raw files, or from that of a TorchRL storage. Raises as ``read_tensordict``."""
+    return read_tensordict(path)
 
 
 def episode_returns(data: TensorDictBase) -> torch.Tensor:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-import shutil
+import re
 import warnings
-import zipfile
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.checkpoint import GlobalRNGState
+from torchrl.data import ReplayBuffer
 
-PREFIX = "checkpoint-"
-"""Of a checkpoint's name; the number of steps follows."""
+from nht.reading import shortened, shown
+from nht.recipes.run.checkpoint_file import CheckpointFile, size_of, write_checkpoint
+from nht.scratch import check_room, publish, remove_leftovers, scratch
+
+NAME = re.compile(r"checkpoint-(\d{1,18})\.torchrl")
+"""Of a checkpoint, with the number of steps; other files are passed over."""
+
+KEPT = 2
 
 
 class Checkpoints:
@@ -19,15 +27,16 @@ class Checkpoints:
 
     Args:
         folder: where they are.
-        parts: what a run goes on from, each with a ``state_dict`` and a ``load_state_dict``; the generators of torch,
-            NumPy and Python are added.
+        parts: what a run goes on from, each with a ``state_dict`` and a ``load_state_dict``, or a replay buffer; the
+            generators of torch, NumPy and Python are added.
     """
 
     def __init__(self, folder: Path, **parts: Any) -> None:
         self._folder = folder
-        # Archives know their checksums; of files mapped into memory nobody would notice that one is cut short.
-        self._checkpoint = Checkpoint(**parts, random=GlobalRNGState(), format="archive")
-        self._rotation = CheckpointRotation(folder, keep_last=2)
+        self._parts = {
+            name: BufferState(part) if isinstance(part, ReplayBuffer) else part
+            for name, part in {**parts, "random": GlobalRNGState()}.items()
+        }
 
     def save(self, frames: int) -> None:
         """Write the state after ``frames`` steps.
@@ -35,22 +44,30 @@ class Checkpoints:
         Raises:
             OSError: if there is no room; earlier checkpoints stay as they are.
         """
+        path = self._folder / f"checkpoint-{frames:012d}.torchrl"
         try:
-            self._check_room()
-            self._rotation.save(self._checkpoint, step=frames)
+            states = {name: part.state_dict() for name, part in self._parts.items()}
+            check_room(self._folder, size_of(states), "the next")
+            with scratch(path) as place:
+                write_checkpoint(place, states)
+                publish(place, path)
         except OSError as error:
             reason = f"no checkpoint after {frames} steps: {error.strerror or error}"
-            raise OSError(error.errno, f"{reason}. The last one is {self._rotation.latest()}") from error
+            latest = max(self._found().items(), default=(0, None))[1]
+            raise OSError(error.errno, f"{reason}. The last one is {latest}") from error
+        self._prune(frames)
 
-    def _check_room(self) -> None:
-        # Buffers are mapped into memory: on a full disk the system would kill the process instead of saying so.
-        if (latest := self._rotation.latest()) is None:
-            return
-        size, free = latest.stat().st_size, shutil.disk_usage(self._folder).free
-        if free < 2.4 * size:  # once as files, once as their archive
-            raise OSError(
-                f"the last one is of {size / 1e6:.1f} MB, only {free / 1e6:.1f} MB are left for the next"
-            )
+    def _prune(self, frames: int) -> None:
+        """Keep the last ones up to now; any that say more steps are of a way that was given up."""
+        found = self._found()
+        kept = sorted(step for step in found if step <= frames)[-KEPT:]
+        for step in found.keys() - set(kept):
+            found[step].unlink(missing_ok=True)
+
+    def _found(self) -> dict[int, Path]:
+        """The checkpoints by their steps, readable or not."""
+        names = {path: NAME.fullmatch(path.name) for path in self._folder.glob("checkpoint-*")}
+        return {int(match[1]): path for path, match in names.items() if match is not None}
 
     def steps(self) -> list[int]:
         """The steps after which checkpoints were written that can be read, oldest first.
@@ -60,29 +77,104 @@ class Checkpoints:
         Raises:
             ValueError: if there are checkpoints, but none that can be read.
         """
-        for unfinished in self._folder.glob(".*"):
-            shutil.rmtree(unfinished) if unfinished.is_dir() else unfinished.unlink()
-        found = {int(path.stem.removeprefix(PREFIX)): path for path in self._folder.glob(f"{PREFIX}*")}
+        remove_leftovers(self._folder)
+        found = self._found()
         readable = [step for step, path in sorted(found.items()) if _is_whole(path)]
         if found and not readable:
             raise ValueError(f"none of the checkpoints in {self._folder} can be read.")
         return readable
 
     def load(self, step: int) -> None:
-        """Go on from the checkpoint after ``step`` steps, one of ``steps()``."""
-        (path,) = (
-            path for path in self._folder.glob(f"{PREFIX}*") if int(path.stem.removeprefix(PREFIX)) == step
-        )
-        self._checkpoint.load(path)
+        """Go on from the checkpoint after ``step`` steps, one of ``steps()``.
+
+        Raises:
+            ValueError: if it was changed, lacks a part, does not fit the run, or its networks are not finite.
+        """
+        path = self._found()[step]
+        with CheckpointFile(path) as file:
+            states = file.read()
+        if missing := sorted(self._parts.keys() - states.keys()):
+            raise ValueError(f"{path} lacks the parts {missing}, it has {shown(sorted(states))}.")
+        for name, part in self._parts.items():
+            if isinstance(part, nn.Module):
+                check_finite(states[name], part.state_dict(), f"{path}, {name!r}")
+        for name, part in sorted(self._parts.items()):
+            try:
+                part.load_state_dict(states[name])
+            except (
+                RuntimeError,
+                ValueError,
+                LookupError,
+                TypeError,
+                AttributeError,
+                ArithmeticError,
+            ) as error:
+                raise ValueError(f"{path}, {name!r} does not fit this run: {shortened(error)}.") from error
+
+
+def check_finite(saved: Any, own: dict[str, Any], where: str) -> None:
+    """Check that the numbers of a network are finite, those aside that are the same in the network as it is built.
+
+    Raises:
+        ValueError: if there are others.
+    """
+    for name, value in saved.items() if isinstance(saved, dict) else ():
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            continue
+        wrong = ~value.isfinite()
+        known = own.get(name)
+        if isinstance(known, Tensor) and known.shape == value.shape:
+            wrong &= value.to(known.device) != known
+        if wrong.any():
+            raise ValueError(
+                f"{where}: {name} holds {int(wrong.sum())} NaN or infinite values: training had diverged."
+            )
 
 
 def _is_whole(path: Path) -> bool:
     """Whether all of an archive is what was written; says so if not."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-    except (zipfile.BadZipFile, OSError) as error:
-        damaged = str(error)
-    if damaged is not None:
-        warnings.warn(f"{path} cannot be read and is passed over: {damaged}", stacklevel=3)
-    return damaged is None
+        with CheckpointFile(path) as file:
+            file.check()
+    except (ValueError, OSError) as error:
+        warnings.warn(f"{path} cannot be read and is passed over: {error}", stacklevel=3)
+        return False
+    return True
+
+
+class BufferState:
+    """What a replay buffer holds, as a state dictionary: its rows as far as it is filled, and where it writes next."""
+
+    def __init__(self, buffer: ReplayBuffer) -> None:
+        self._buffer = buffer
+
+    def state_dict(self) -> dict[str, Any]:
+        """Rows ``(len(buffer),)`` by key, not copied; the state of writer and sampler."""
+        buffer = self._buffer
+        rows = buffer.storage[: len(buffer)].to_dict() if len(buffer) else {}
+        return {
+            "rows": rows,
+            "writer": dict(buffer.writer.state_dict()),
+            "sampler": dict(buffer.sampler.state_dict()),
+        }
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Hold the rows of ``saved``.
+
+        Raises:
+            ValueError: if there are more than the buffer has room for.
+        """
+        rows, storage = saved["rows"], self._buffer.storage
+        if rows:
+            length = _length(rows)
+            if length > storage.max_size:
+                raise ValueError(f"it holds {length} rows, the buffer has room for {storage.max_size}.")
+            storage.set(range(length), TensorDict(rows, batch_size=[length], device=storage.device))
+        self._buffer.writer.load_state_dict(saved["writer"])
+        if saved.get("sampler"):
+            self._buffer.sampler.load_state_dict(saved["sampler"])
+
+
+def _length(rows: dict[str, Any]) -> int:
+    first = next(iter(rows.values()))
+    return _length(first) if isinstance(first, dict) else len(first)

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 import nht
 from nht.envs import FOREIGN, make_env
 from nht.envs.table import imported
+from nht.recipes.maps.kinds import task_context_keys
 from nht.recipes.run.collecting import MakeEnv, worker_seed
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import EnvConfig, Training
@@ -41,7 +42,8 @@ def mapped_env(
         KeyError, ValueError: if the map does not fit the task: the keys or widths of its context, its actuation.
     """
     base = base_env(env, seed=seed, num_envs=num_envs, device=device)
-    return TransformedEnv(base, ActionMapTransform(map))
+    untold = map.context_dim and map.context_keys is None
+    return TransformedEnv(base, ActionMapTransform(map, task_context_keys(env) if untold else None))
 
 
 def base_env(

@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -15,14 +16,18 @@ import pandas
 import torch
 import yaml
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 import nht
+from nht.reading import shortened
 from nht.recipes.agents.table import find_algorithm, name_of
 from nht.recipes.maps.interface import run_map
 from nht.recipes.maps.kinds import default_scale, map_context_keys
+from nht.recipes.run.config_file import check_code, read_settings
 from nht.recipes.run.dashboard import Dashboard, open_dashboard
-from nht.recipes.run.environments import check_env
+from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
+from nht.recipes.run.metrics_file import read_metrics
 from nht.recipes.run.ownership import claimed, owner_of
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import Training
@@ -82,7 +87,13 @@ class RunFolder:
                 undo.pop_all()
         ranks.wait()
         self.resuming = ranks.any(self.resuming)
-        self.map = kept_map(self.path, read_config(self.path), ranks.device)
+        self.map = kept_map(self.path, read_config(self.path, self._named()), ranks.device)
+
+    def _named(self) -> list[str]:
+        """Modules that the command line names by import paths, and that the folder therefore may name."""
+        config = self.config
+        names = [name_of(type(config)), config.env.name, config.env.suite, config.map.kind]
+        return [name.partition(":")[0] for name in names if ":" in name]
 
     def _begin(self, undo: ExitStack) -> None:
         fresh = not self.path.exists()
@@ -102,7 +113,9 @@ class RunFolder:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
         if not (kept := self.path / MAP_FILE).exists():
-            nht.save_map(run_map(self.config, motors), kept)
+            map = run_map(self.config, motors)
+            mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
+            nht.save_map(map, kept)
         self._dashboard = open_dashboard(self.path, self.config)
 
     def _look(self) -> None:
@@ -117,7 +130,7 @@ class RunFolder:
                 f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
             )
         if self.resuming:
-            self._check_same(*_read(settings))
+            self._check_same(*_read(settings, self._named()))
 
     def _check_same(self, algorithm: str, saved: Training) -> None:
         now = name_of(type(self.config))
@@ -130,11 +143,9 @@ class RunFolder:
         before, after = _flat(asdict(saved)), _flat(asdict(self.config))
         changed = [name for name in after if before.get(name) != after[name] and not _is_taken(name)]
         if changed:
-            differences = ", ".join(f"{name}={before.get(name)} (now {after[name]})" for name in changed)
-            raise ValueError(
-                f"{self.path} holds a run with {differences}: these cannot change. Go on with what it has, or choose "
-                "another run.folder."
-            )
+            old = ", ".join(f"{name}={before.get(name)}" for name in changed)
+            new = ", ".join(f"{name}={after[name]}" for name in changed)
+            raise ValueError(f"{self.path} holds a run with {old}: it cannot go on with {new}.")
 
     def _write_config(self) -> None:
         described = {"recipe": name_of(type(self.config)), **asdict(self.config)}
@@ -167,19 +178,18 @@ class RunFolder:
     def rewind(self, frames: int) -> None:
         """Drop the rows behind ``frames``, or cut short by a kill: a resumed run writes them again.
 
-        Its clock goes on from the last row that stays.
+        Its clock goes on from the last row that stays. Raises ValueError if the file holds anything else.
         """
         if not self._ranks.first or not self.metrics.exists():
             return
-        with self.metrics.open(newline="") as file:
-            rows = list(csv.reader(file))
-        kept = [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= frames]
+        heading, rows = read_metrics(self.metrics)
+        kept = [row for row in rows if int(row[0]) <= frames]
         if not kept:
             self.metrics.unlink()  # its heading may be cut short, too
             return
-        self._started -= float(kept[-1][rows[0].index(SECONDS)])
+        self._started -= float(kept[-1][heading.index(SECONDS)])
         with replacing(self.metrics) as scratch, scratch.open("w", newline="") as file:
-            csv.writer(file).writerows([rows[0], *kept])
+            csv.writer(file).writerows([heading, *kept])
 
     def finish(self, frames: int) -> None:
         """Hand video and map to W&B, note that the run is whole, and show it."""
@@ -214,24 +224,32 @@ def resolved(config: Training) -> Training:
     return replace(config, env=env, map=map)
 
 
-def read_config(folder: Path) -> Training:
+def read_config(folder: Path, allow: Sequence[str] = ()) -> Training:
     """The configuration that a run was started with.
+
+    Args:
+        folder: of the run.
+        allow: packages whose code it may name by import paths.
 
     Raises:
         FileNotFoundError: if the folder holds no run.
-        ValueError: if its configuration cannot be read.
+        ValueError: if its configuration cannot be read, or names code of other packages.
     """
     if not (folder / CONFIG_FILE).exists():
         raise FileNotFoundError(f"{folder} holds no run: it has no {CONFIG_FILE}.")
-    return _read(folder / CONFIG_FILE)[1]
+    return _read(folder / CONFIG_FILE, allow)[1]
 
 
-def _read(settings: Path) -> tuple[str, Training]:
+def _read(settings: Path, allow: Sequence[str] = ()) -> tuple[str, Training]:
     """The name of the algorithm, and the configuration."""
-    saved = yaml.safe_load(settings.read_text())
+    saved = read_settings(settings)
+    check_code(saved, settings, allow)
     algorithm = saved.pop("recipe", OLDEST_ALGORITHM)
-    schema = OmegaConf.structured(find_algorithm(algorithm).schema)
-    return algorithm, cast(Training, OmegaConf.to_object(OmegaConf.merge(schema, saved)))
+    try:
+        schema = OmegaConf.structured(find_algorithm(algorithm).schema)
+        return algorithm, cast(Training, OmegaConf.to_object(OmegaConf.merge(schema, saved)))
+    except (OmegaConfBaseException, ValueError, TypeError, AttributeError, ArithmeticError) as error:
+        raise ValueError(f"{settings} is no configuration of a run: {shortened(error)}.") from error
 
 
 def kept_map(folder: Path, config: Training, device: torch.device | str = "cpu") -> nht.ActionMap:

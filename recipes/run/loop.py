@@ -108,6 +108,9 @@ class Loop:
                 before = {number: signal.signal(number, self._stop) for number in SIGNALS}
             self._record.show_progress()
             yield self._batches()
+        except BaseException:
+            self._folder.close()
+            raise
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pandas
 
+from nht.reading import entry, known_entries, read_json, shortened
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.run.metrics import EVERY_RUN
@@ -55,6 +56,9 @@ def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
     return f"{stage}/{interface}/{configuration:03d}-seed{seed}"
 
 
+ENDINGS = ("done", "failed", "diverged")
+
+
 @dataclass(frozen=True)
 class Ending:
     """How a run came out: ``done``, ``failed`` or ``diverged``, and why."""
@@ -64,9 +68,21 @@ class Ending:
 
     @classmethod
     def read(cls, run: Path) -> Ending | None:
-        """What was recorded in the run's folder; None if the run has not ended."""
+        """What was recorded in the run's folder; None if the run has not ended.
+
+        Raises:
+            ValueError: if something else stands there.
+        """
         file = run / "outcome.json"
-        return cls(**json.loads(file.read_text())) if file.exists() else None
+        if not file.exists():
+            return None
+        record = read_json(file)
+        known_entries(record, ("status", "reason"), str(file))
+        if entry(record, "status", str, str(file)) not in ENDINGS:
+            raise ValueError(
+                f"{file}: 'status' must be one of {list(ENDINGS)}, got {shortened(record['status'], 60)!r}."
+            )
+        return cls(record["status"], entry(record, "reason", str, str(file)))
 
     def write(self, run: Path) -> None:
         """Record it in the run's folder."""
@@ -107,8 +123,6 @@ def _train(job: Job, run: Path) -> Ending:
         contextlib.redirect_stderr(log),
     ):
         print(f"python -m nht.recipes.{job.recipe}", *overrides)
-        if (run / "policy.safetensors").exists():
-            return Ending("done")  # all but the outcome was written
         try:
             algorithm.train(configure(algorithm.schema, job.recipe, overrides))
         except FloatingPointError as error:

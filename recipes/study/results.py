@@ -9,25 +9,8 @@ import numpy as np
 import pandas
 from scipy import stats
 
+from nht.recipes.study.rows_file import COLUMNS, read_rows
 from nht.recipes.study.scores import Scores
-
-COLUMNS = (
-    "version",
-    "metric",
-    "stage",
-    "env",
-    "interface",
-    "configuration",
-    "seed",
-    "status",
-    "reason",
-    "frames",
-    "eval_success",
-    "eval_failure",
-    "eval_return",
-    "seconds",
-)
-"""Of ``rows.csv``; those behind them are hyperparameters."""
 
 OURS = "nht"
 
@@ -107,19 +90,8 @@ class SearchResults:
 
 
 def read_results(file: Path) -> SearchResults:
-    """Read ``rows.csv``.
-
-    Raises:
-        ValueError: if it has no rows, lacks columns, or its rows are of different versions.
-    """
-    rows = pandas.read_csv(file, dtype={"reason": str})
-    if missing := [name for name in COLUMNS if name not in rows.columns]:
-        raise ValueError(f"{file} lacks the columns {missing}: it is not what a search writes.")
-    if rows.empty:
-        raise ValueError(f"{file} has no rows: the search has not finished a run yet.")
-    if len(versions := sorted(rows["version"].unique())) > 1:
-        raise ValueError(f"{file} mixes rows of the versions {versions}, which do not go together.")
-    return SearchResults.of(rows.assign(reason=rows["reason"].fillna("")))
+    """Read ``rows.csv``. Raises as ``read_rows`` does."""
+    return SearchResults.of(read_rows(file))
 
 
 def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:

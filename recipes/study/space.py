@@ -12,6 +12,7 @@ from zlib import crc32
 
 import numpy as np
 
+from nht.reading import entry, known_entries, read_json
 from nht.storage import replacing
 
 Value = int | float | str
@@ -142,9 +143,17 @@ def write_manifest(path: Path, settings: dict[str, Any]) -> None:
     """
     manifest = {"version": VERSION, "settings": settings}
     if path.exists():
-        _check_same(path, json.loads(path.read_text()), manifest)
+        _check_same(path, _read_manifest(path), manifest)
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(manifest, indent=1))
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    manifest = read_json(path)
+    known_entries(manifest, ("version", "settings"), str(path))
+    entry(manifest, "version", str, str(path))
+    entry(manifest, "settings", dict, str(path))
+    return manifest
 
 
 def _check_same(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
@@ -156,7 +165,11 @@ def _check_same(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
     changed = [
         f"{name} was {before.get(name)}, is {now.get(name)}"
         for name in sorted(before.keys() | now.keys())
-        if before.get(name) != now.get(name) and not (name in GROWING and now[name] >= before[name])
+        if before.get(name) != now.get(name) and not (name in GROWING and _grows(before.get(name), now[name]))
     ]
     if changed:
         raise ValueError(f"{path} is of another search: {'; '.join(changed)}. Choose another search.folder.")
+
+
+def _grows(before: Any, now: int) -> bool:
+    return type(before) is int and now >= before

@@ -1,0 +1,280 @@
+"""The file of a checkpoint: state dictionaries in one archive in TorchRL's layout, written and read without pickle.
+
+An archive is a ZIP file of members that are stored, not compressed. For each part it has ``state.json``, which says how
+dictionaries, lists and numbers are nested, and a raw file for each tensor with a ``meta.json`` beside them; and
+``manifest.json`` says what parts there are, with a checksum of each member. Archives of earlier versions have no
+checksums but those of ZIP, and hold the replay buffer as TorchRL's ``dump`` leaves it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tempfile
+import uuid
+import zipfile
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nht.memmap import DTYPES, PLAIN, raw, read_tensordict
+from nht.reading import MAX_TEXT, checksum, entry, parse_json, plain_file, shortened
+from nht.recipes.run.state_json import decoded, encoded
+
+FORMAT, FORMAT_VERSION = "torchrl.checkpoint", 1
+MANIFEST = "manifest.json"
+CHUNK = 2**24
+DAMAGED = (
+    zipfile.BadZipFile,
+    OSError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    OverflowError,
+)
+"""What ``zipfile`` raises on archives that are damaged."""
+
+
+def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
+    """Write state dictionaries to a new file.
+
+    Args:
+        file: not there yet.
+        parts: by name, dictionaries of tensors, arrays, numbers, text, lists, tuples and dictionaries.
+
+    Raises:
+        OSError: if there is no room.
+        TypeError: for values of other types.
+    """
+    records: dict[str, Any] = {}
+    sums: dict[str, str] = {}
+    with zipfile.ZipFile(file, "x", zipfile.ZIP_STORED) as archive:
+        for number, (name, state) in enumerate(sorted(parts.items())):
+            folder, tensors = f"components/{number:04d}-{name}", {}
+            files = {"state.json": json.dumps(encoded(state, tensors), separators=(",", ":")).encode()}
+            about: dict[str, Any] = {key: _about(value) for key, value in tensors.items()}
+            about |= {"shape": [], "device": "cpu", "_type": PLAIN}
+            files["state/meta.json"] = json.dumps(about, separators=(",", ":")).encode()
+            files |= {f"state/{key}.memmap": value for key, value in tensors.items() if value.numel()}
+            for inner, content in files.items():
+                sums[f"{folder}/{inner}"] = _write(archive, f"{folder}/{inner}", content)
+            records[name] = {
+                "adapter": "torchrl.state_dict",
+                "adapter_version": 1,
+                "path": folder,
+                "files": sorted(files),
+            }
+        manifest = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "container": "archive",
+            "checkpoint_id": uuid.uuid4().hex,
+            "created_at": datetime.now(UTC).isoformat(),
+            "versions": {package: version(package) for package in ("nht", "torchrl", "tensordict", "torch")},
+            "metadata": {},
+            "components": records,
+            "sha256": sums,
+        }
+        _write(archive, MANIFEST, json.dumps(manifest | {"checksum": checksum(manifest)}, indent=2).encode())
+
+
+def size_of(state: Any) -> int:
+    """Bytes of all tensors and arrays in a state dictionary."""
+    if isinstance(state, Tensor):
+        return state.numel() * state.element_size()
+    if isinstance(state, np.ndarray):
+        return state.nbytes
+    if isinstance(state, Mapping):
+        return sum(size_of(value) for value in state.values())
+    return sum(map(size_of, state)) if isinstance(state, (list, tuple)) else 0
+
+
+def _about(value: Tensor) -> dict[str, Any]:
+    return {"device": "cpu", "shape": list(value.shape), "dtype": str(value.dtype), "is_nested": False}
+
+
+def _write(archive: zipfile.ZipFile, name: str, content: bytes | Tensor) -> str:
+    """Write a member; its SHA-256."""
+    view = raw(content) if isinstance(content, Tensor) else memoryview(content)
+    digest = hashlib.sha256()
+    with archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as member:
+        for start in range(0, len(view), CHUNK):
+            digest.update(view[start : start + CHUNK])
+            member.write(view[start : start + CHUNK])
+    return digest.hexdigest()
+
+
+class CheckpointFile:
+    """A checkpoint that is open for reading; nothing is unpickled, unpacked or written.
+
+    Args:
+        file: of the checkpoint.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        ValueError: if it is damaged, was changed, or is not a checkpoint.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = plain_file(file)
+        try:
+            self._archive = zipfile.ZipFile(file)
+            self._members = self._checked_members()
+        except DAMAGED as error:
+            raise ValueError(f"{file} is no checkpoint, or is cut short: {shortened(error)}.") from error
+        self._sums: dict[str, str] = {}
+        self.manifest = self._read_manifest()
+        self._sums = self.manifest.get("sha256", {})
+
+    def __enter__(self) -> CheckpointFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._archive.close()
+
+    def _checked_members(self) -> dict[str, zipfile.ZipInfo]:
+        """By name; each once, stored as it is, and all together no larger than the file."""
+        members = {info.filename: info for info in self._archive.infolist()}
+        if len(members) < len(self._archive.infolist()):
+            raise ValueError("two members have the same name")
+        for name, info in members.items():
+            if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
+                raise ValueError(f"{shortened(name, 80)!r} is compressed or encrypted, expected it as it is")
+            if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name:
+                raise ValueError(f"{shortened(name, 80)!r} would lie outside")
+        if sum(info.file_size for info in members.values()) > self.file.stat().st_size:
+            raise ValueError("its members are said to be larger than the file")
+        return members
+
+    def _read_manifest(self) -> dict[str, Any]:
+        where = f"{self.file}, {MANIFEST}"
+        manifest = self._json(MANIFEST)
+        if manifest.get("format") != FORMAT:
+            raise ValueError(f"{where} is not marked {FORMAT!r}.")
+        if entry(manifest, "format_version", int, where) != FORMAT_VERSION:
+            raise ValueError(
+                f"{where} has format version {manifest['format_version']}, expected {FORMAT_VERSION}."
+            )
+        expected = manifest.pop("checksum", None)
+        if ("sha256" in manifest or expected is not None) and expected != checksum(manifest):
+            raise ValueError(
+                f"{where} was changed since it was written: its checksum is that of another one."
+            )
+        for name, record in entry(manifest, "components", dict, where).items():
+            if not isinstance(record, dict):
+                raise ValueError(f"{where}: component {shortened(name, 80)!r} must be an object.")
+            entry(record, "path", str, where)
+            entry(record, "adapter", str, where)
+        return manifest
+
+    def check(self) -> None:
+        """Raise ValueError unless every byte is what was written."""
+        if self._sums and self._sums.keys() != self._members.keys() - {MANIFEST}:
+            raise ValueError(f"{self.file} has other members than its {MANIFEST} says.")
+        for name in self._members:
+            self._read(name)
+
+    def read(self) -> dict[str, Any]:
+        """The state dictionaries by part. A replay buffer that TorchRL dumped is a dictionary of rows and writer."""
+        found = {}
+        for name, record in self.manifest["components"].items():
+            try:
+                if record["adapter"] == "torchrl.dump_load":
+                    found[name] = self._dumped_buffer(record["path"])
+                else:
+                    found[name] = self._state(record["path"])
+            except RecursionError:
+                raise ValueError(f"{self.file}, {name!r} is nested too deeply.") from None
+        return found
+
+    def _state(self, folder: str) -> Any:
+        about = self._json(f"{folder}/state/meta.json")
+        where = f"{self.file}, {folder}"
+        tensors = {
+            key: self._tensor(f"{folder}/state/{key}.memmap", entry_, f"{where}, {shortened(key, 40)!r}")
+            for key, entry_ in about.items()
+            if isinstance(entry_, dict)
+        }
+        return decoded(self._json(f"{folder}/state.json"), tensors, where)
+
+    def _tensor(self, name: str, about: dict[str, Any], where: str) -> Tensor:
+        kind, shape = entry(about, "dtype", str, where), entry(about, "shape", list, where)
+        if kind not in DTYPES or not all(type(size) is int and size >= 0 for size in shape):
+            raise ValueError(
+                f"{where} has no possible type and shape: {shortened(kind, 40)} {shortened(shape, 80)}."
+            )
+        needed = math.prod(shape) * DTYPES[kind].itemsize
+        if not needed:
+            return torch.empty(shape, dtype=DTYPES[kind])
+        found = self._member(name).file_size
+        if found != needed:
+            raise ValueError(f"{where} has {found:,} bytes, expected {needed:,} for {kind} {shape}.")
+        tensor = torch.empty(shape, dtype=DTYPES[kind])
+        self._read(name, raw(tensor))
+        return tensor
+
+    def _dumped_buffer(self, folder: str) -> dict[str, Any]:
+        """A replay buffer as TorchRL's ``dump`` left it, less what it pickles: a queue that is empty here."""
+        inner = f"{folder}/storage/"
+        with tempfile.TemporaryDirectory(prefix="nht-checkpoint-") as scratch:
+            for name in self._members:
+                if name.startswith(inner):
+                    place = Path(scratch, *PurePosixPath(name[len(inner) :]).parts)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    with place.open("wb") as output:
+                        self._read(name, output=output)
+            rows = read_tensordict(scratch).clone().to_dict()
+        writer = self._json(f"{folder}/writer/metadata.json")
+        where = f"{self.file}, {folder}"
+        return {
+            "rows": rows,
+            "writer": {
+                "_cursor": entry(writer, "cursor", int, where),
+                "_write_count": entry(writer, "write_count", int, where),
+            },
+        }
+
+    def _member(self, name: str) -> zipfile.ZipInfo:
+        if name not in self._members:
+            raise ValueError(f"{self.file} lacks {shortened(name, 120)!r}.")
+        return self._members[name]
+
+    def _json(self, name: str) -> dict[str, Any]:
+        size = self._member(name).file_size
+        if size > MAX_TEXT:
+            raise ValueError(
+                f"{self.file}, {name} has {size:,} bytes, expected text of at most {MAX_TEXT:,}."
+            )
+        content = memoryview(bytearray(size))
+        self._read(name, content)
+        return parse_json(bytes(content), f"{self.file}, {name}")
+
+    def _read(self, name: str, into: memoryview | None = None, output: Any = None) -> None:
+        """Read all of a member, compare its checksums, and put it where it is wanted."""
+        digest, done = hashlib.sha256(), 0
+        try:
+            with self._archive.open(self._member(name)) as member:
+                while chunk := member.read(CHUNK):
+                    digest.update(chunk)
+                    if into is not None:
+                        into[done : done + len(chunk)] = chunk
+                    if output is not None:
+                        output.write(chunk)
+                    done += len(chunk)
+        except DAMAGED as error:
+            raise ValueError(
+                f"{self.file}, {shortened(name, 120)} is damaged: {shortened(error)}."
+            ) from error
+        if self._sums and name != MANIFEST and self._sums.get(name) != digest.hexdigest():
+            raise ValueError(
+                f"{self.file}, {name} was changed since it was written: its checksum is another."
+            )

@@ -1,0 +1,124 @@
+"""Parallel collectors: workers get the policy's weights and their own seeds, and leave nothing behind."""
+
+import multiprocessing
+import os
+
+import pandas
+import pytest
+import torch
+
+import nht.recipes.ppo
+import tiny_runs
+from nht.recipes.agents.ppo import estimate_advantages
+from nht.recipes.config import DDPG
+from nht.recipes.launch import configure
+from nht.recipes.run.collecting import worker_seed
+from nht.recipes.run.record import Record
+from nht.recipes.sections import CollectorConfig
+
+SETTINGS = ["algo.total_frames=400", "evaluation.every=400"]
+
+
+def train(algorithm, kind, folder, *overrides):
+    return tiny_runs.train(algorithm, folder, *SETTINGS, f"collector={kind}", *overrides)
+
+
+def assert_nothing_runs():
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+def test_workers_make_exactly_as_many_steps(algorithm, kind, tmp_path, monkeypatch):
+    batches = []
+    count = Record.count_steps
+    monkeypatch.setattr(
+        Record, "count_steps", lambda run, data: (batches.append(data.clone()), count(run, data))
+    )
+    metrics = train(algorithm, kind, tmp_path / "run")
+    assert metrics["frames"].tolist() == [400]
+    copies = {"multi_sync": 4, "multi_async": 2}[kind]
+    assert [tuple(batch.shape) for batch in batches] == 4 * [(copies, 100 // copies)]
+    if kind == "multi_sync":  # each worker draws its own goals and noise
+        first = batches[0]
+        assert not torch.equal(first["observation"][:2, 0], first["observation"][2:, 0])
+        assert not torch.equal(first["action"][:2], first["action"][2:])
+    assert_nothing_runs()
+
+
+@pytest.mark.slow
+def test_synchronous_workers_repeat_a_run(tmp_path):
+    first = train("ddpg", "multi_sync", tmp_path / "first", "algo.random_frames=200")
+    again = train("ddpg", "multi_sync", tmp_path / "again", "algo.random_frames=200")
+    other = train("ddpg", "multi_sync", tmp_path / "other", "algo.random_frames=200", "seed=1")
+    pandas.testing.assert_frame_equal(first, again)
+    assert not first.equals(other)
+
+
+@pytest.mark.slow
+def test_workers_act_by_the_policy_as_it_is(tmp_path, monkeypatch):
+    seen = []
+
+    def compare(data, features, critic, gae):
+        now = features(data.select("observation").clone())
+        seen.append((float(features.module.count), now["features"], data["features"].clone()))
+        estimate_advantages(data, features, critic, gae)
+
+    monkeypatch.setattr(nht.recipes.ppo, "estimate_advantages", compare)
+    train("ppo", "multi_sync", tmp_path / "run")
+    assert [count for count, _, _ in seen] == [0, 100, 200, 300]
+    for _, now, then in seen:
+        torch.testing.assert_close(now, then)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_no_worker_outlives_an_error(kind, error, tmp_path, monkeypatch):
+    workers = []
+
+    def fail(run, _):
+        workers.extend(multiprocessing.active_children())
+        raise error
+
+    monkeypatch.setattr(Record, "count_steps", fail)
+    with pytest.raises(error):
+        train("ddpg", kind, tmp_path / "run")
+    assert len(workers) >= 2
+    assert_nothing_runs()
+    for worker in workers:
+        with pytest.raises(ProcessLookupError):
+            os.kill(worker.pid, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+def test_a_run_with_workers_goes_on(kind, tmp_path):
+    train("ddpg", kind, tmp_path / "run", "evaluation.every=200")
+    metrics = train(
+        "ddpg", kind, tmp_path / "run", "evaluation.every=200", "algo.total_frames=800", "run.resume=true"
+    )
+    assert metrics["frames"].tolist() == [200, 400, 600, 800]
+    assert metrics["updates"].tolist() == [6, 12, 18, 24]
+    with pytest.raises(ValueError, match=r"holds a run with collector\.kind=multi_.*sync"):
+        train("ddpg", "single", tmp_path / "run", "algo.total_frames=1000", "run.resume=true")
+
+
+def test_seeds_of_workers_differ_and_repeat():
+    seeds = {worker_seed(seed, rank, worker) for seed in range(3) for rank in range(3) for worker in range(3)}
+    assert len(seeds) == 27
+    assert worker_seed(1, 2) == worker_seed(1, 2)
+
+
+def test_errors():
+    with pytest.raises(
+        ValueError, match=r"collector\.kind must be single, multi_sync or multi_async, got 'ray'"
+    ):
+        CollectorConfig(kind="ray")
+    with pytest.raises(ValueError, match=r"collector\.num_workers must be at least 1, got 0"):
+        CollectorConfig(kind="multi_sync", num_workers=0)
+    with pytest.raises(ValueError, match=r"collector=single has no workers, got collector\.num_workers=2"):
+        CollectorConfig(num_workers=2)
+    with pytest.raises(ValueError, match=r"env\.num_envs=4 must be a multiple of collector\.num_workers=3"):
+        configure(DDPG, "ddpg", ["env.num_envs=4", "collector=multi_sync", "collector.num_workers=3"])

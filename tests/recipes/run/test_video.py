@@ -1,0 +1,97 @@
+"""Films of test episodes: what is on them, and that the last moment is."""
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+import nht
+from nht.recipes.run.environments import mapped_env
+from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.video import COLOURS, SHEET_COLUMNS, TILE, Film, contact_sheet, grid, record_video
+from nht.recipes.sections import EnvConfig
+
+STILL = TensorDictModule(lambda observation: torch.zeros(len(observation), 7), ["observation"], ["action"])
+DOWN = TensorDictModule(  # the second joint presses the tool into the table
+    lambda observation: torch.eye(7)[1].repeat(len(observation), 1), ["observation"], ["action"]
+)
+FIRST_DOWN = TensorDictModule(
+    lambda observation: torch.eye(7)[1] * torch.eye(len(observation))[0][:, None], ["observation"], ["action"]
+)
+
+
+def wipe(**options):
+    config = EnvConfig(context_keys=[], options={"max_episode_steps": 9, **options})
+    map = nht.Identity(7)
+    map.action_scale.fill_(2.0)
+    return mapped_env(config, map, seed=0, num_envs=3)
+
+
+def tile(value):
+    return np.full((4, 6, 3), value, dtype=np.uint8)
+
+
+def test_a_grid_has_about_as_many_rows_as_columns_and_white_gaps():
+    pictures = [tile(value) for value in range(5)]
+    picture = grid(pictures)
+    assert picture.shape == (8, 18, 3)
+    assert [picture[0, 6 * i, 0] for i in range(3)] == [0, 1, 2]
+    assert [picture[4, 6 * i, 0] for i in range(3)] == [3, 4, 255]
+    assert grid([tile(7)]).shape == (4, 6, 3)
+
+
+def test_a_contact_sheet_goes_from_start_to_end():
+    frames = [[tile(moment), tile(100 + moment)] for moment in range(50)]
+    sheet = contact_sheet(frames)
+    assert sheet.shape == (4, 3 * SHEET_COLUMNS, 3)
+    assert (sheet[0, 0, 0], sheet[0, -1, 0], sheet[-1, -1, 0]) == (0, 49, 149)
+
+
+@pytest.mark.usefixtures("can_render")
+def test_films_show_every_copy_to_the_end(tmp_path):
+    outcome = record_video(wipe(), DOWN, tmp_path / "film.mp4")
+    assert outcome.failure.all()
+    video = imageio.imread(tmp_path / "film.mp4")
+    width, height = TILE
+    assert video.shape[1:] == (2 * height, 2 * width, 3)
+    sheet = imageio.imread(tmp_path / "film.png")
+    assert sheet.shape == (3 * height // 2, SHEET_COLUMNS * width // 2, 3)
+    assert tuple(sheet[0, 0]) == COLOURS[""]
+    assert tuple(sheet[0, -1]) == COLOURS["failed"]
+
+
+@pytest.mark.usefixtures("can_render")
+def test_an_episode_that_has_ended_stands_still():
+    env = wipe(terminate_on_failure=True)
+    film = Film(env.base_env.task)
+    ended = []
+
+    def watch(outcome):
+        film.add(outcome)
+        ended.append(bool(outcome["done"][0]))
+
+    evaluate(env, FIRST_DOWN, on_step=watch)
+    film.close()
+    end = film.frames[-1]
+    assert ended.index(True) < 8
+    assert np.array_equal(end[0], film.frames[-2][0])
+    assert not np.array_equal(end[0], film.frames[0][0])
+    assert not np.array_equal(end[1], film.frames[-2][1])  # its clock runs on
+
+
+def test_whoever_watches_sees_the_last_step_and_no_reset():
+    env, seen = wipe(), []
+    evaluate(
+        env, DOWN, on_step=lambda outcome: seen.append((outcome["joint_angle"].clone(), outcome["done"]))
+    )
+    assert len(seen) == 1 + 9
+    assert seen[-1][1].all()
+    assert not seen[0][1].any()
+    assert (seen[-1][0][:, 1] > seen[0][0][:, 1] + 0.1).all()  # still where the policy brought it
+
+
+def test_watching_changes_nothing():
+    plain = evaluate(wipe(), STILL)
+    watched = evaluate(wipe(), STILL, on_step=lambda outcome: None)
+    torch.testing.assert_close(plain.episode_return, watched.episode_return)

@@ -1,0 +1,106 @@
+"""What tests/test_ranks.py lets torchrun start: updates of either algorithm, each rank on its share of the batches."""
+
+import sys
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.modules import MLP
+
+from nht.recipes import ddpg, ppo
+from nht.recipes.agents.ddpg import PaperDDPGLoss
+from nht.recipes.agents.norm import ReturnNorm, RunningNorm
+from nht.recipes.agents.off_policy import JointSoftUpdate
+from nht.recipes.agents.ppo import GaussianActor, GaussianPPOLoss
+from nht.recipes.run.ranks import Ranks
+
+OBSERVATION, ACTION, BATCH, UPDATES = 5, 2, 64, 10
+
+
+def networks(features):
+    torch.manual_seed(0)
+    norm = TensorDictModule(RunningNorm(OBSERVATION), ["observation"], ["features"])
+    mean = MLP(OBSERVATION, ACTION, num_cells=[16, 16])
+    if features == "ppo":
+        actor = TensorDictModule(
+            GaussianActor(mean, ACTION, 0.5), ["features"], ["sample", "sample_log_prob", "action"]
+        )
+        critic = TensorDictModule(MLP(OBSERVATION, 1, num_cells=[16]), ["features"], ["state_value"])
+    else:
+        actor = TensorDictModule(nn.Sequential(mean, nn.Tanh()), ["features"], ["action"])
+        critic = TensorDictModule(
+            MLP(OBSERVATION + ACTION, 1, num_cells=[16]), ["features", "action"], ["state_action_value"]
+        )
+    return norm, actor, critic
+
+
+def batches():
+    """Steps of all ranks, the same wherever they are drawn."""
+    draws = torch.Generator().manual_seed(1)
+
+    def normal(*shape):
+        return torch.randn(BATCH, *shape, generator=draws)
+
+    for _ in range(UPDATES):
+        yield TensorDict(
+            {
+                "observation": 3 * normal(OBSERVATION) + 1,
+                "action": normal(ACTION).tanh(),
+                "sample": normal(ACTION),
+                "sample_log_prob": normal(),
+                "advantage": 5 * normal(1) + 2,
+                "value_target": normal(1),
+                "state_value": normal(1),
+                "steps_to_next_obs": torch.ones(BATCH, dtype=torch.int64),
+                "next": {
+                    "observation": 3 * normal(OBSERVATION) + 1,
+                    "reward": normal(1),
+                    "done": normal(1) > 1,
+                    "terminated": normal(1) > 1,
+                },
+            },
+            [BATCH],
+        )
+
+
+def update(algorithm, ranks):
+    """Weights and statistics after the updates."""
+    norm, actor, critic = networks(algorithm)
+    rewards = ReturnNorm(BATCH // ranks.size, gamma=0.9)
+    if algorithm == "ddpg":
+        loss = PaperDDPGLoss(actor, critic, gamma=0.9, action_l2=0.1)
+        target = JointSoftUpdate(loss, eps=0.9)
+    else:
+        coefficients = {"clip": 0.2, "clip_value": True, "critic_coeff": 0.5, "entropy_coeff": 0.01}
+        loss = GaussianPPOLoss(actor, critic, **coefficients, add=ranks.sum if ranks.size > 1 else None)
+    if ranks.rank:
+        with torch.no_grad():  # started apart, they must come together
+            for parameter in loss.parameters():
+                parameter.add_(1.0)
+    ranks.broadcast(loss)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    for whole in batches():
+        batch = whole.chunk(ranks.size)[ranks.rank].clone()
+        norm.module.update(batch["observation"], ranks.sum)
+        rewards(batch.unsqueeze(1), add=ranks.sum)
+        norm(batch)
+        if algorithm == "ddpg":
+            norm(batch["next"])
+            ddpg.descend(batch, loss, optimiser, ranks)
+            target.step()
+        else:
+            ppo.descend(batch, loss, optimiser, 0.5, ranks)
+    return [
+        *loss.state_dict().values(),
+        *norm.state_dict().values(),
+        *rewards.statistics.state_dict().values(),
+    ]
+
+
+if __name__ == "__main__":
+    ranks = Ranks()
+    for algorithm in ("ddpg", "ppo"):
+        torch.save(update(algorithm, ranks), Path(sys.argv[1]) / f"{algorithm}-{ranks.rank}.pt")
+    ranks.part()
