@@ -23,9 +23,9 @@ Observations = NDArray[np.float32]
 class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
     """N copies of a task that one native call steps together, with what ``SyncVectorEnv`` returns.
 
-    One generator draws for all copies, so that one seed repeats them, or a list of one for each. ``infos`` holds arrays with N rows: the flags
-    ``success``, ``failure`` and ``diverged`` and the task's raw keys; a mask ``_key`` beside each names the rows that
-    are of this call. What is returned belongs to the caller.
+    One generator draws for all copies, so that one seed repeats them, or a list of one for each. ``infos`` holds
+    arrays with N rows: the flags ``success``, ``failure`` and ``diverged`` and the task's raw keys; a mask ``_key``
+    beside each names the rows that are of this call. What is returned belongs to the caller.
 
     A copy whose episode has ended is started anew as ``autoreset_mode`` says:
 

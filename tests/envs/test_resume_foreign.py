@@ -1,5 +1,6 @@
 """Saved simulators of others go on bit for bit: every MuJoCo task of Gymnasium, the hands, mazes, the suite."""
 
+import os
 import pickle
 from contextlib import closing
 from pathlib import Path
@@ -125,7 +126,8 @@ from test_resume_foreign import goes_on_exactly
 from nht.envs import make_dm_control
 goes_on_exactly(make_dm_control({NEEDS_OPENGL!r}, seed=0), before=5, after=3)
 """
-    found = run(code, MUJOCO_GL="egl", PYTHONPATH=str(Path(__file__).parent))
+    folders = Path(__file__).parent, Path(__file__).parents[1] / "support"
+    found = run(code, MUJOCO_GL="egl", PYTHONPATH=os.pathsep.join(map(str, folders)))
     assert found.returncode == 0, found.stderr
 
 
