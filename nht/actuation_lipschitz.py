@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from nht.action_map import ActionMap
-from nht.align import Aligned
+from nht.alignment import Aligned
 from nht.linear_map import LinearActionMap
 from nht.lipschitz import certificate, offset_certificate
 from nht.offset import ConstantOffset, NetworkOffset

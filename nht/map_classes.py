@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 
 from nht.action_map import ActionMap
-from nht.align import Aligned
+from nht.alignment import Aligned
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.maps import NHT, SVD, Identity

@@ -83,6 +83,7 @@ def _read_run(metrics: Path, allow: Sequence[str]) -> pandas.DataFrame:
     interface = "raw" if config.map.kind == "none" else config.map.kind
     rows.insert(0, "interface", interface)
     rows.insert(1, "seed", config.seed)
+    rows["algorithm"] = type(config).__name__
     return rows
 
 

@@ -76,7 +76,8 @@ def _check_widths(file: Path, text: str) -> None:
         for line in lines:
             if line and len(line) != len(heading):
                 raise ValueError(
-                    f"{file}, line {lines.line_num} has {len(line)} values for {len(heading)} columns: it was cut short."
+                    f"{file}, line {lines.line_num} has {len(line)} values for {len(heading)} columns: it was cut "
+                    "short."
                 )
     except csv.Error as error:
         raise ValueError(f"{file} is no table of a search: {shortened(error)}.") from None

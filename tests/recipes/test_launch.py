@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from nht.recipes.agents.sac import SAC
+from nht.recipes.agents.td3 import TD3
 from nht.recipes.config import DDPG, CollectDemos, CompareMaps, Evaluate, InspectDemos, Report, TrainMap
 from nht.recipes.launch import configure, launch
 
@@ -15,6 +17,8 @@ SCHEMAS = {
     "train_map": TrainMap,
     "compare_maps": CompareMaps,
     "ddpg": DDPG,
+    "sac": SAC,
+    "td3": TD3,
     "evaluate": Evaluate,
     "report": Report,
 }

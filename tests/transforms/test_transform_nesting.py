@@ -104,7 +104,6 @@ def test_the_snapshot_comes_first_and_once():
         ToyArm(), Compose(StepCounter(), RewardSum(), toy_transform(), StepCounter(step_count_key="late"))
     )
     assert [type(transform) for transform in env.transform] == [
-        ContextSnapshot,
         StepCounter,
         RewardSum,
         ActionMapTransform,
