@@ -164,7 +164,9 @@ def test_unknown_names():
         make_dm_control("walker-fly", seed=0)
     with pytest.raises(ValueError, match=r"no task 'walker': the domain 'walker' has"):
         make_dm_control("walker", seed=0)
-    with pytest.raises(ValueError, match=r"unknown env.suite 'dmc': .*\['nht', 'dm_control', 'gymnasium'\]"):
+    with pytest.raises(
+        ValueError, match=r"unknown env.suite 'dmc': .*\['nht', 'dm_control', 'gymnasium', 'torchrl'\]"
+    ):
         base_env(EnvConfig("cheetah-run", "dmc"), seed=0)
 
 
