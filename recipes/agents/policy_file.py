@@ -14,7 +14,8 @@ from nht.memmap import raw
 from nht.reading import plain_file, shortened, shown
 from nht.scratch import publish, scratch
 
-FORMAT = "nht.policy"
+CHECKSUM = "sha256"
+"""In the header. It stands there alone: safetensors writes several entries in an order that changes."""
 
 
 def write_policy(weights: Mapping[str, Tensor], file: Path) -> None:
@@ -25,7 +26,7 @@ def write_policy(weights: Mapping[str, Tensor], file: Path) -> None:
     """
     tensors = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
     with scratch(file) as place:
-        place.write_bytes(save(tensors, {"format": FORMAT, "sha256": _checksum(tensors)}))
+        place.write_bytes(save(tensors, {CHECKSUM: _checksum(tensors)}))
         publish(place, file)
 
 

@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from nht.recipes.study.results import SearchResults
 from nht.recipes.maps.kinds import KINDS
+from nht.recipes.study.results import SearchResults
 from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
 OTHERS = ("#A6761D", "#7570B3", "#E7298A")

@@ -76,8 +76,12 @@ def _check_widths(file: Path, text: str) -> None:
         for line in lines:
             if line and len(line) != len(heading):
                 raise ValueError(
+<<<<<<< HEAD
                     f"{file}, line {lines.line_num} has {len(line)} values for {len(heading)} columns: it was cut "
                     "short."
+=======
+                    f"{file}, line {lines.line_num}: {len(line)} values for {len(heading)} columns, it was cut short."
+>>>>>>> 8f4c63833b5c2191dbb284cd98c5a2a138649bfd
                 )
     except csv.Error as error:
         raise ValueError(f"{file} is no table of a search: {shortened(error)}.") from None
@@ -96,9 +100,6 @@ def _check_values(file: Path, rows: pandas.DataFrame) -> None:
     for name in NUMBERS:
         if not pandas.api.types.is_numeric_dtype(rows[name]) or np.isinf(rows[name].astype(float)).any():
             raise ValueError(f"{file}: {name} must be a finite number, or missing, in every row.")
-    done = rows[rows["status"] == "done"]
-    if done[list(NUMBERS)].isna().any(axis=None):
-        raise ValueError(f"{file}: a run that is done lacks values of its evaluations.")
     if (rows["frames"] % 1 > 0).any() or (rows["frames"] < 0).any():
         raise ValueError(f"{file}: frames must be counts.")
     evaluation = ["stage", "interface", "configuration", "seed", "frames"]

@@ -190,8 +190,8 @@ def save_and_be_killed(path: Path) -> None:
 
 
 def test_what_a_killed_process_left_is_removed_by_the_next_and_what_lives_stays(tmp_path: Path) -> None:
-    here = Path(__file__).parent
-    code = f"import sys; sys.path.insert(0, {str(here)!r}); import test_demos; from pathlib import Path; "
+    here = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "support")]
+    code = f"import sys; sys.path[:0] = {here}; import test_demos; from pathlib import Path; "
     process = fresh_process.run(code + f"test_demos.save_and_be_killed(Path({str(tmp_path / 'demos')!r}))")
     assert process.returncode == -signal.SIGKILL, process.stderr
     (left,) = tmp_path.iterdir()

@@ -1,4 +1,4 @@
-"""A package of one's own, `tests/outside`: its map, task and algorithm run through everything, no edit of ours needed."""
+"""A package of one's own, `tests/outside`: its map, task and algorithm run through everything we have."""
 
 import os
 import subprocess
