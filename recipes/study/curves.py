@@ -77,7 +77,7 @@ def groups(curves: pandas.DataFrame, lines: str) -> Iterator[tuple[str, pandas.D
 
 
 def summarise(curves: pandas.DataFrame, metric: str = SUCCESS, lines: str = "interface") -> pandas.DataFrame:
-    """Per interface, or algorithm: seeds, steps, and the mean and interquartile mean over seeds of the last evaluation of all.
+    """Per interface, or algorithm: seeds, steps, mean and interquartile mean over seeds of the last evaluation of all.
 
     For success also the failures, and the median of the steps to a success of 0.9.
     """

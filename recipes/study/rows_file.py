@@ -76,12 +76,7 @@ def _check_widths(file: Path, text: str) -> None:
         for line in lines:
             if line and len(line) != len(heading):
                 raise ValueError(
-<<<<<<< HEAD
-                    f"{file}, line {lines.line_num} has {len(line)} values for {len(heading)} columns: it was cut "
-                    "short."
-=======
                     f"{file}, line {lines.line_num}: {len(line)} values for {len(heading)} columns, it was cut short."
->>>>>>> 8f4c63833b5c2191dbb284cd98c5a2a138649bfd
                 )
     except csv.Error as error:
         raise ValueError(f"{file} is no table of a search: {shortened(error)}.") from None
