@@ -60,7 +60,8 @@ class RunFolder:
         ranks: the processes that learn together.
 
     Raises:
-        FileExistsError: if the folder holds a run already and ``run.resume`` is false, or another process owns it.
+        FileExistsError: if ``run.resume`` is false and the folder holds a run already, unless it is this very run and
+            whole; or if another process owns it.
         FileNotFoundError: if ``run.resume`` is true and there is nothing to resume.
         ValueError: if the run that is to go on has other settings, or the task or map cannot be made as told. Nothing
             is left behind then.
@@ -125,12 +126,16 @@ class RunFolder:
         self.resuming = settings.exists()
         if resume is True and not self.resuming:
             raise FileNotFoundError(f"{self.path} holds no run to resume.")
-        if resume is False and self.resuming:
-            raise FileExistsError(
-                f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
-            )
+        refusal = f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
+        if resume is False and self.resuming and not self.whole:
+            raise FileExistsError(refusal)
         if self.resuming:
-            self._check_same(*_read(settings, self._named()))
+            try:
+                self._check_same(*_read(settings, self._named()))
+            except ValueError as error:
+                if resume is False:
+                    raise FileExistsError(refusal) from error
+                raise
 
     def _check_same(self, algorithm: str, saved: Training) -> None:
         now = name_of(type(self.config))

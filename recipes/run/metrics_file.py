@@ -40,7 +40,7 @@ def read_metrics(file: Path) -> tuple[list[str], list[list[str]]]:
 def metrics_table(file: Path) -> pandas.DataFrame:
     """The same as numbers, a column for each name of the heading."""
     heading, rows = read_metrics(file)
-    table = pandas.DataFrame(rows, columns=heading).astype(float)
+    table = pandas.DataFrame(rows, columns=heading or [FRAMES]).astype(float)
     return table.astype({FRAMES: int})
 
 

@@ -38,7 +38,7 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
     if not metrics:
         raise FileNotFoundError(f"no {METRICS_FILE} in or below {[str(folder) for folder in folders]}.")
     curves = pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
-    if curves.empty:
+    if curves.empty or tested(SUCCESS) not in curves:
         raise FileNotFoundError(
             f"no run in or below {[str(folder) for folder in folders]} has an evaluation yet."
         )

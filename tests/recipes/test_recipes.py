@@ -220,10 +220,12 @@ def test_interquartile_mean_leaves_out_the_best_and_the_worst_quarter():
 # Bad input.
 
 
-def test_a_run_is_never_overwritten(run, map_file):
+@pytest.mark.parametrize("override", ["seed=1", "algo.total_frames=4000"])
+def test_a_run_is_never_overwritten(run, map_file, override):
     folder, metrics = run
+    pandas.testing.assert_frame_equal(train(folder, map_file), metrics)  # it is whole, and says so
     with pytest.raises(FileExistsError, match=r"holds a run already: go on with run.resume=true"):
-        train(folder, map_file)
+        train(folder, map_file, override)
     pandas.testing.assert_frame_equal(
         pandas.read_csv(folder / "metrics.csv").drop(columns="seconds"), metrics
     )
