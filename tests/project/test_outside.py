@@ -63,6 +63,7 @@ from nht.recipes.config import CollectDemos, CompareMaps, DDPG, Evaluate, Report
 from nht.recipes.launch import configure
 
 tiny = sys.argv[1:]
+assert configure(DDPG, "ddpg", ["env=six_reach_wide"]).env.options == {"radius": 0.1}
 collect_demos.main(configure(CollectDemos, "collect_demos", ["env=six_reach", "demos.transitions=600", "out=demos"]))
 demos = nht.load_demos("demos", env="six_reach")
 assert demos.manifest["expert"] == "ReachExpert" and bool(demos.data["success"][-1])

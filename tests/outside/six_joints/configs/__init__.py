@@ -1,0 +1,1 @@
+"""YAML choices of one's own."""
