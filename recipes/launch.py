@@ -18,12 +18,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nht.envs import TASKS
+from nht.envs.table import Table
 from nht.recipes.maps.kinds import KINDS
 from nht.recipes.sections import Training
 
 Config = TypeVar("Config")
 
-NAMED = {"env": TASKS, "map": KINDS}
+NAMED: dict[str, Table[Any]] = {"env": TASKS, "map": KINDS}
 """Groups whose choices need no YAML: what the table has, ``env=my_package.tasks:Pour``, is a choice, too."""
 EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, RuntimeError)
 """Errors that say by themselves what is wrong; HYDRA_FULL_ERROR=1 shows where they come from."""

@@ -22,11 +22,13 @@ from nht.recipes.config import Search, SearchConfig
 from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import configure, launch
 from nht.recipes.maps.kinds import KINDS, MapKind, find_kind, tasks_with_arm
+from nht.recipes.run.metrics import FRAMES
 from nht.recipes.run.ownership import claimed
 from nht.recipes.study.cluster import Cluster
 from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
 from nht.recipes.study.report import summary
-from nht.recipes.study.results import COLUMNS, SearchResults, read_results
+from nht.recipes.study.results import SearchResults, read_results
+from nht.recipes.study.rows_file import COLUMNS
 from nht.recipes.study.space import draw, write_manifest
 from nht.storage import replacing
 
@@ -232,7 +234,7 @@ def together(ended: Rows) -> pandas.DataFrame:
     rows = pandas.concat(list(ended.values()), ignore_index=True)
     rows = rows.reindex(columns=[*COLUMNS, *sorted(set(rows.columns) - set(COLUMNS))])
     late = rows["stage"].eq("best").rename("late")
-    order = rows.assign(late=late).sort_values(["late", "configuration", "seed", "interface", "frames"]).index
+    order = rows.assign(late=late).sort_values(["late", "configuration", "seed", "interface", FRAMES]).index
     return rows.loc[order].reset_index(drop=True)
 
 

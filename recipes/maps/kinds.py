@@ -180,7 +180,7 @@ def make_map(
     _check_options(map, list(taken))
     arguments = {name: value for name, value in given.items() if name in taken}
     if map.lipschitz is not None and map.lipschitz_per_layer and "lipschitz" in taken:
-        gain = build(**arguments | {"lipschitz": None}).network_gain
+        gain = _unlimited_gain(build, arguments)
         arguments["lipschitz"] = gain * map.lipschitz ** (len(map.hidden) + 1)  # constants multiply
     try:
         return build(**arguments)
@@ -188,6 +188,13 @@ def make_map(
         raise ValueError(
             f"map.kind {map.kind!r} cannot be built from {sorted(arguments)}: {error}."
         ) from error
+
+
+def _unlimited_gain(build: Callable[..., nht.ActionMap], arguments: dict[str, Any]) -> float:
+    """From the network's output to the basis."""
+    map = build(**arguments | {"lipschitz": None})
+    assert isinstance(map, nht.LinearActionMap)
+    return map.network_gain
 
 
 def _check_options(map: MapConfig, taken: list[str]) -> None:

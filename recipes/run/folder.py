@@ -126,7 +126,9 @@ class RunFolder:
         self.resuming = settings.exists()
         if resume is True and not self.resuming:
             raise FileNotFoundError(f"{self.path} holds no run to resume.")
-        refusal = f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
+        refusal = (
+            f"{self.path} holds a run already: go on with run.resume=true, or choose another run.folder."
+        )
         if resume is False and self.resuming and not self.whole:
             raise FileExistsError(refusal)
         if self.resuming:

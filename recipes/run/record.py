@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from tensordict import TensorDictBase
 from tqdm import tqdm
@@ -34,7 +35,7 @@ class Record:
         self.counters = Counters()
         self.statistics = TrainingStatistics(envs.train.base_env.action_spec.space, losses)
         self._total, self._every = folder.config.algo.total_frames, folder.config.evaluation.every
-        self._bar: tqdm[None] | None = None
+        self._bar: tqdm[Any] | None = None
 
     @property
     def frames(self) -> int:

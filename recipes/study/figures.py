@@ -17,6 +17,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
 from nht.recipes.maps.kinds import KINDS
+from nht.recipes.run.metrics import FRAMES, SUCCESS, tested
 from nht.recipes.study.results import SearchResults
 from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
@@ -74,7 +75,7 @@ def _label(results: SearchResults) -> str:
 
 
 def _bound(axes: Axes, results: SearchResults, axis: str = "y") -> None:
-    if results.metric == "success":
+    if results.metric == SUCCESS:
         axes.set(**{f"{axis}lim": (-0.05, 1.05)})
     axes.grid(alpha=0.3, axis="both")
     axes.spines[["top", "right"]].set_visible(False)
@@ -114,7 +115,7 @@ def _curves(results: SearchResults, out: Path) -> Figure:
         number, rows, is_fresh = results.best(name)
         fresh.append(is_fresh)
         seeds = rows["seed"].nunique()
-        reached = rows.groupby("frames")[f"eval_{results.metric}"].apply(lambda scores: scores.to_numpy())
+        reached = rows.groupby(FRAMES)[tested(results.metric)].apply(lambda scores: scores.to_numpy())
         reached = reached[reached.map(len) == seeds]
         steps = reached.index.to_numpy()
         bands = np.array([interval(scores) for scores in reached])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 
+from nht.recipes.run.metrics import FRAMES, SUCCESS
 from nht.recipes.study import figures as search_figures
 from nht.recipes.study.results import OURS, SearchResults, read_results
 from nht.recipes.study.scores import (
@@ -51,12 +52,12 @@ def counts(results: SearchResults) -> str:
     again = results.stage("best")
     text = (
         f"{runs['configuration'].nunique()} configurations x {runs['seed'].nunique()} seeds of "
-        f"{runs['frames'].max():,.0f} steps for each of {len(results.interfaces)} interfaces, {len(runs)} runs"
+        f"{runs[FRAMES].max():,.0f} steps for each of {len(results.interfaces)} interfaces, {len(runs)} runs"
     )
     if len(again):
         text += (
             f"; the best configuration of each once more on {again['seed'].nunique()} fresh seeds, "
-            f"{again['frames'].max():,.0f} steps"
+            f"{again[FRAMES].max():,.0f} steps"
         )
     return f"{text}. Score: {results.metric} of the test episodes after the last step. Intervals: 95 %, bootstrap."
 
@@ -64,7 +65,7 @@ def counts(results: SearchResults) -> str:
 def summary(results: SearchResults) -> pandas.DataFrame:
     """A row per interface: how it does over configurations, and at its best."""
     rng = np.random.default_rng(0)
-    digits = ".3f" if results.metric == "success" else ",.0f"
+    digits = ".3f" if results.metric == SUCCESS else ",.0f"
     rows = []
     for interface in results.interfaces:
         scores = results.scores(interface)

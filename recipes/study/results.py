@@ -9,6 +9,7 @@ import numpy as np
 import pandas
 from scipy import stats
 
+from nht.recipes.run.metrics import SUCCESS, tested
 from nht.recipes.study.rows_file import COLUMNS, read_rows
 from nht.recipes.study.scores import Scores
 
@@ -97,6 +98,6 @@ def read_results(file: Path) -> SearchResults:
 def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
     """The last evaluation of every run as its ``score``; of one that did not get to its end, the worst there is."""
     runs = rows.groupby(["stage", "interface", "configuration", "seed"], sort=False).tail(1).copy()
-    score = runs[f"eval_{metric}"].astype(float)
-    worst = 0.0 if metric == "success" else score.min()
+    score = runs[tested(metric)].astype(float)
+    worst = 0.0 if metric == SUCCESS else score.min()
     return runs.assign(score=np.where((runs["status"] == "done") & score.notna(), score, worst))

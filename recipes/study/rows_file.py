@@ -10,6 +10,7 @@ import numpy as np
 import pandas
 
 from nht.reading import read_text, shortened, shown
+from nht.recipes.run.metrics import EVERY_RUN, FRAMES, RETURN, SUCCESS
 
 COLUMNS = (
     "version",
@@ -21,22 +22,18 @@ COLUMNS = (
     "seed",
     "status",
     "reason",
-    "frames",
-    "eval_success",
-    "eval_failure",
-    "eval_return",
-    "seconds",
+    *EVERY_RUN,
 )
 """Of ``rows.csv``; those behind them are hyperparameters."""
 
 CHOICES = {
-    "metric": ("success", "return"),
+    "metric": (SUCCESS, RETURN),
     "stage": ("search", "best"),
     "status": ("done", "failed", "diverged"),
 }
 TEXTS = ("version", "reason", "env", "interface")
 COUNTS = ("configuration", "seed")
-NUMBERS = ("frames", "eval_success", "eval_failure", "eval_return", "seconds")
+NUMBERS = EVERY_RUN
 """Missing where a run failed before its first evaluation."""
 
 
@@ -95,8 +92,8 @@ def _check_values(file: Path, rows: pandas.DataFrame) -> None:
     for name in NUMBERS:
         if not pandas.api.types.is_numeric_dtype(rows[name]) or np.isinf(rows[name].astype(float)).any():
             raise ValueError(f"{file}: {name} must be a finite number, or missing, in every row.")
-    if (rows["frames"] % 1 > 0).any() or (rows["frames"] < 0).any():
+    if (rows[FRAMES] % 1 > 0).any() or (rows[FRAMES] < 0).any():
         raise ValueError(f"{file}: frames must be counts.")
-    evaluation = ["stage", "interface", "configuration", "seed", "frames"]
+    evaluation = ["stage", "interface", "configuration", "seed", FRAMES]
     if (twice := rows.duplicated(evaluation)).any():
         raise ValueError(f"{file} has {int(twice.sum())} evaluations twice.")

@@ -33,7 +33,11 @@ def folder(tmp_path):
 
 def test_an_old_map_file_is_read_as_it_was():
     map = nht.load_map(OLD / "map.safetensors")
-    assert (map.saturation, map.offset, map.context_keys) == ("clip", "none", ("tool_position", "joint_angle"))
+    assert (map.saturation, map.offset, map.context_keys) == (
+        "clip",
+        "none",
+        ("tool_position", "joint_angle"),
+    )
     action, context = torch.tensor([[0.5, -2.0]]), torch.linspace(-1, 1, 10)[None]
     assert torch.equal(map.rest(context), torch.zeros(1, 7))
     low, high = torch.full((7,), -0.1), torch.full((7,), 0.1)
