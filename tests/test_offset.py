@@ -117,7 +117,9 @@ def around(rest: Tensor) -> Demos:
     """Demonstrations u = rest + B a in R^7, of two dimensions."""
     context, action = normal(2_000, CONTEXT_DIM).float(), normal(2_000, K, seed=1).float()
     across = normal(N, K, seed=2)
-    plane = torch.linalg.qr(across - across.mean(0)).Q.float()  # across the direction in which all motors are alike
+    plane = torch.linalg.qr(
+        across - across.mean(0)
+    ).Q.float()  # across the direction in which all motors are alike
     return Demos.from_tensors(
         actuation=rest + action @ plane.mT, context=context, episode=torch.arange(2_000) // 50
     )
