@@ -56,6 +56,7 @@ LAYERS = {
     "nht.networks": 0,
     "nht.episodes": 0,
     "nht.saturation": 0,
+    "nht.allowance": 0,
     "nht.arguments": 0,
     "nht.torch_internals": 0,
     "nht.demos": 1,
