@@ -59,6 +59,7 @@ LAYERS = {
     "nht.allowance": 0,
     "nht.arguments": 0,
     "nht.torch_internals": 0,
+    "nht.widths": 0,
     "nht.demos": 1,
     "nht.action_map": 1,
     "nht.offset": 1,
