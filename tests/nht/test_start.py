@@ -88,6 +88,15 @@ def test_a_random_start_is_what_it_was() -> None:
     assert all(torch.equal(value, before[name]) for name, value in map.state_dict().items())
 
 
+def test_a_trained_map_goes_on_from_where_it_is(demos: Demos) -> None:
+    map = nht.NHT(CONTEXT_DIM, N, K, (16,), offset="contextual")
+    first = nht.train_map(demos, map, max_steps=250).metrics["validation_error"]
+    before = map.network.linear(-1).bias.clone()
+    again = nht.train_map(demos, map, max_steps=1, learning_rate=1e-6).metrics["validation_error"]
+    assert again == pytest.approx(first, rel=1e-3)
+    torch.testing.assert_close(map.network.linear(-1).bias, before, rtol=0, atol=1e-5)
+
+
 def test_fewer_actuations_than_directions_are_enough_to_start() -> None:
     directions = principal_directions(normal(2, N), 4)
     assert torch.allclose(directions.mT @ directions, torch.eye(4, dtype=torch.float64))
