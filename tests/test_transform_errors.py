@@ -210,9 +210,8 @@ def test_the_recorded_context_must_not_be_removed():
         KeyError, match="removed 'context', the recorded context: put the ActionMapTransform in"
     ):
         env.reset()
-    kept = TransformedEnv(
-        ToyArm(), Compose(SelectTransform("joint", "raw", "context", "received"), toy_transform())
-    )
+    selected = SelectTransform(("raw", "joint"), ("raw", "tool"), "joint", "context", "received")
+    kept = TransformedEnv(ToyArm(), Compose(selected, toy_transform()))
     assert_mapped(kept.rollout(3))
 
 
