@@ -1,7 +1,7 @@
 """What happens at the motors' limits, ``scale`` or ``clip``: learning with either, through the same maps.
 
-Three tasks, three seeds each; the action scales are large enough for policies to meet the limits. One process at a time.
-A run that is finished is not repeated, one that was interrupted goes on. Every evaluation is a row of
+Three tasks, three seeds each; the action scales are large enough for policies to meet the limits. One process at a
+time. A run that is finished is not repeated, one that was interrupted goes on. Every evaluation is a row of
 ``benchmarks/results/saturation.csv``.
 
     python benchmarks/saturation.py FOLDER [TASK ...]
@@ -84,7 +84,15 @@ def learn(run: Path, task: str, seed: int, map_file: Path) -> None:
     quiet = ["evaluation.video=false", "run.wandb=false", "run.checkpoint_every=102_400", "run.resume=auto"]
     if recipe == "ddpg":
         quiet[2] = "run.checkpoint_every=20_000"
-    call(recipe, *TASKS[task]["map"], *settings, *quiet, f"map.file={map_file}", f"run.folder={run}", f"seed={seed}")
+    call(
+        recipe,
+        *TASKS[task]["map"],
+        *settings,
+        *quiet,
+        f"map.file={map_file}",
+        f"run.folder={run}",
+        f"seed={seed}",
+    )
     (run / "finished").touch()
 
 
@@ -106,7 +114,9 @@ def write(folder: Path) -> None:
                     if (run / "finished").exists():
                         with (run / "metrics.csv").open() as metrics:
                             for row in csv.DictReader(metrics):
-                                writer.writerow([task, kind, seed, row["frames"], *(row[key] for key in COLUMNS)])
+                                writer.writerow(
+                                    [task, kind, seed, row["frames"], *(row[key] for key in COLUMNS)]
+                                )
 
 
 if __name__ == "__main__":

@@ -66,7 +66,12 @@ def fit(
     map = nht.NHT(width, n, k, (128, 128), lipschitz=limit, start=start, seed=seed)
     found = nht.train_map(demos, map, context_keys=keys, max_steps=3_000, seed=seed).metrics
     flat = nht.train_map(demos, nht.SVD(n, k, width), context_keys=keys, seed=seed).metrics
-    values = [found["validation_error"], found["best_step"], flat["validation_error"], round(found["seconds"], 1)]
+    values = [
+        found["validation_error"],
+        found["best_step"],
+        flat["validation_error"],
+        round(found["seconds"], 1),
+    ]
     return [task, limit, start, seed, *values]
 
 
@@ -74,7 +79,8 @@ def table() -> Iterator[str]:
     """Mean and worst of the seeds, in Markdown."""
     with OUT.open() as file:
         rows = list(csv.DictReader(file))
-    yield "| task | limit | SVD | from SVD's plane: mean (worst) | random start: mean (worst) | better in |\n|---|---|---|---|---|---|"
+    yield "| task | limit | SVD | from SVD's plane: mean (worst) | random start: mean (worst) | better in |"
+    yield "|---|---|---|---|---|---|"
     for task, limit in product(ACTION_DIMS, LIMITS):
         those = [row for row in rows if row["task"] == task and row["lipschitz"] in (str(limit), limit or "")]
         by_start = {

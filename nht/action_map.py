@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from types import FunctionType
@@ -74,9 +75,9 @@ class ActionMap(nn.Module, ABC):
             raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}")
         if context_dim < 0:
             raise ValueError(f"context_dim must be 0 or more, got {context_dim}")
-        self.context_dim = int(context_dim)
-        self.actuation_dim = int(actuation_dim)
-        self.action_dim = int(action_dim)
+        self.context_dim = operator.index(context_dim)
+        self.actuation_dim = operator.index(actuation_dim)
+        self.action_dim = operator.index(action_dim)
         self.context_keys: tuple[NestedKey, ...] | None = None
         self.data_fingerprint: str | None = None
         self.saturation = DEFAULT_SATURATION

@@ -150,7 +150,7 @@ def least_squares(basis: Tensor, actuation: Tensor) -> Tensor:
     independent, and finite, in value and gradient, where they are not. What a rank-deficient basis leaves
     open gets about the smallest action.
     """
-    if basis.dtype in (torch.float16, torch.bfloat16):  # for which torch solves no equations
+    if basis.dtype in (torch.float16, torch.bfloat16):  # the damping would count there
         return least_squares(basis.float(), actuation.float()).to(basis.dtype)
     rounding = torch.finfo(basis.dtype).eps
     # Of unit size, lest squaring overflow. A basis below rounding counts as none.
@@ -161,3 +161,9 @@ def least_squares(basis: Tensor, actuation: Tensor) -> Tensor:
     gram = columns.mT @ columns + damping * identity
     action = torch.linalg.solve_ex(gram, columns.mT @ actuation.unsqueeze(-1)).result
     return (action / size).squeeze(-1)
+
+
+def solve(matrix: Tensor, right: Tensor) -> Tensor:
+    """X of A X = B, unchecked: in single precision where they are of half, for which PyTorch solves no equations."""
+    working = torch.promote_types(matrix.dtype, torch.float32)
+    return torch.linalg.solve_ex(matrix.to(working), right.to(working)).result.to(matrix.dtype)

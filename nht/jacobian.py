@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from nht.geometry import solve
 from nht.maps import LinearActionMap
 
 
@@ -89,7 +90,7 @@ class JacobianPinv(LinearActionMap):
     def basis(self, context: Tensor) -> Tensor:
         """The damped pseudo-inverse of J(q), (*batch, n, 6)."""
         jacobian = self.jacobian(context)
-        return torch.linalg.solve_ex(self._damped_gram(jacobian), jacobian).result.mT
+        return solve(self._damped_gram(jacobian), jacobian).mT
 
     def basis_norm(self) -> float:
         """1 / (2 damping)."""
@@ -98,7 +99,7 @@ class JacobianPinv(LinearActionMap):
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
         """J(q)^+ a: the least joint velocity that moves the tool as asked."""
         jacobian = self.jacobian(context)
-        solved = torch.linalg.solve_ex(self._damped_gram(jacobian), action.unsqueeze(-1)).result
+        solved = solve(self._damped_gram(jacobian), action.unsqueeze(-1))
         return (jacobian.mT @ solved).squeeze(-1)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:

@@ -140,7 +140,7 @@ class LASER(CAE):
         self.needs_next_context = beta_dynamics > 0
         self.dynamics = self._network(context_dim, action_dim, 2) if self.needs_next_context else None
         self.register_buffer("change_length", torch.ones(()))
-        self.noise = torch.Generator().manual_seed(seed)
+        self.noise = torch.Generator().manual_seed(int(seed))
 
     def latent(self, actuation: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log-variance of the latent's Gaussian: (*batch, n), (*batch, context_dim) -> twice (*batch, k)."""

@@ -104,7 +104,8 @@ def _concrete() -> Iterator[type[ActionMap]]:
     return (kind for kind in dict.fromkeys(_subclasses(ActionMap)) if not inspect.isabstract(kind))
 
 
-def _subclasses(parent: type[ActionMap]) -> Iterator[type[ActionMap]]:
+def _subclasses(parent: type) -> Iterator[type]:
+    child: type
     for child in parent.__subclasses__():
         yield child
         yield from _subclasses(child)

@@ -124,10 +124,15 @@ class NHT(LinearActionMap):
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normaliser and where to start; the rest is left to gradient steps."""
+        """Sets the normaliser and where to start; the rest is left to gradient steps.
+
+        A map that has been trained goes on from where it is.
+        """
         context, actuation = batch["context"], batch["actuation"]
         if self.normalise:
             self.network.normalise(context)
+        if self.data_fingerprint is not None:
+            return False
         if isinstance(self.offset_model, ConstantOffset | NetworkOffset):
             self.offset_model.fit(context, actuation, normalise=self.normalise)
         if self.start == "svd":

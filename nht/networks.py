@@ -116,7 +116,7 @@ class ContextNetwork(nn.Module):
         """Lets all contexts start from nearly the same output, normally distributed with deviation `size`."""
         head = self.linear(-1)
         head.weight.mul_(0.1)
-        head.bias.normal_(std=size, generator=torch.Generator().manual_seed(seed))
+        head.bias.normal_(std=size, generator=torch.Generator().manual_seed(int(seed)))
 
     @torch.no_grad()
     def start_from(self, output: Tensor) -> None:

@@ -69,26 +69,16 @@ def scale_into(
         rest: (*batch, n), or None for zero.
     """
     given = actuation.dtype
-    # Half precision has no room for the quotients below.
-    working = torch.promote_types(given, torch.float32)
+    working = torch.promote_types(given, torch.float32)  # half precision has no room for the quotient below
     wide = actuation.to(working)
     start = torch.zeros_like(wide) if rest is None else rest.to(working)
     largest = torch.finfo(working).max
-    away = (wide - start).clamp(-largest, largest)
-    # 1 / t: how often the longest way of a motor exceeds what there is room for.
-    excess = torch.ones_like(away[..., :1])
-    if high is not None:
-        excess = torch.maximum(excess, _excess(away, high.to(working) - start))
-    if low is not None:
-        excess = torch.maximum(excess, _excess(-away, start - low.to(working)))
-    fitting = torch.where(excess == 1, wide, start + away / excess)
+    way = (wide - start).clamp(-largest, largest)
+    above = torch.inf if high is None else high.to(working) - start
+    below = torch.inf if low is None else start - low.to(working)
+    room = torch.where(way > 0, above, below)
+    # 1 / t, how often the way of a motor exceeds its room; instead of no room the least that leaves the slope finite.
+    least = torch.finfo(working).tiny ** 0.5
+    excess = torch.where(room < 0, 0, way.abs() / room.clamp_min(least)).amax(-1, keepdim=True).clamp_min(1)
+    fitting = torch.where(excess == 1, wide, start + way / excess)
     return fitting.to(given).clamp(low, high)
-
-
-def _excess(way: Tensor, room: Tensor) -> Tensor:
-    """The largest way per room for it, (*batch, 1); ways of no or negative length, and negative room, count as 0."""
-    least = (
-        torch.finfo(room.dtype).tiny ** 0.5
-    )  # instead of no room at all, for quotient and slope to stay finite
-    share = torch.where(room < 0, torch.zeros_like(room), way / room.clamp_min(least))
-    return share.amax(-1, keepdim=True)

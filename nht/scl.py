@@ -86,6 +86,7 @@ class SCL(LinearActionMap):
         """Sets the normaliser and where u0 starts; the weights are left to gradient steps."""
         if self.normalise:
             self.network.normalise(batch["context"])
-        if isinstance(self.offset_model, ConstantOffset | NetworkOffset):
+        untrained = self.data_fingerprint is None
+        if untrained and isinstance(self.offset_model, ConstantOffset | NetworkOffset):
             self.offset_model.fit(batch["context"], batch["actuation"], normalise=self.normalise)
         return False

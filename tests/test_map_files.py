@@ -474,12 +474,12 @@ def refusal(path: Path) -> str | None:
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_every_mutation_is_taken_whole_or_refused_by_one_sentence(path: Path, version: int) -> None:
-    """A changed byte, a cut, an insertion: 600 each. Of version 1, what has no checksum may go unnoticed."""
+    """A changed byte, a cut, an insertion: 2,000 each. Of version 1, what has no checksum may go unnoticed."""
     if version == 1:
         as_version_1(path)
     content, generator = path.read_bytes(), random.Random(version)
     taken = 0
-    for _ in range(600):
+    for _ in range(2_000):
         at = generator.randrange(len(content))
         kind = generator.choice(["byte", "cut", "more", "text"])
         if kind == "byte":
@@ -499,4 +499,4 @@ def test_every_mutation_is_taken_whole_or_refused_by_one_sentence(path: Path, ve
         taken += answer is None
         assert answer is None or (answer.startswith(str(path)) and len(answer) < 1_000)
         assert path.read_bytes() == mutated
-    assert taken == 0 if version == 2 else taken < 300
+    assert taken == 0 if version == 2 else taken < 1_000

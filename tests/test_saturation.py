@@ -263,6 +263,18 @@ def test_decoding_compiles_into_one_graph_and_batches_by_vmap(map: ActionMap) ->
     torch.testing.assert_close(compiled(action, context, LOW, HIGH), expected)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_the_jacobian_works_in_half_precision(dtype: torch.dtype) -> None:
+    map = nht.JacobianPinv(
+        [0.0, 0.0, 0.1, -0.1, 0.0, 0.0, 0.0], [1.5, -1.5, 1.5, -1.5, 1.5, -1.5, 0.0], [0.3] * 7, 0.3
+    )
+    context = torch.linspace(-1, 1, 7)
+    action = torch.full((6,), 0.1)
+    actuation = map.to(dtype).decode(action, context)
+    assert actuation.dtype == map.encode(actuation, context).dtype == dtype
+    torch.testing.assert_close(actuation.float(), map.float().decode(action, context), rtol=0.1, atol=0.02)
+
+
 def test_the_default_and_what_is_set_survive_copies() -> None:
     map = nht.NHT(CONTEXT_DIM, 5, 2, (8,))
     other = {"scale": "clip", "clip": "scale"}[map.saturation]
