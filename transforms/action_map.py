@@ -155,8 +155,7 @@ class ActionMapTransform(Attachment):
             )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        if self.context_keys and not self.reads_early:
-            self.read_raw(next_tensordict)
+        self._see_to_context(next_tensordict)
         executed = tensordict.get(self.actuation_key)
         self._repeats.remember(tensordict, executed)
         stepped = tensordict.get("_step", None)  # of these copies only
@@ -166,10 +165,21 @@ class ActionMapTransform(Attachment):
         return next_tensordict.set(self.executed_key, executed)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if self.context_keys and not self.reads_early:
-            self.read_raw(tensordict_reset)
+        self._see_to_context(tensordict_reset)
         idle = self._executed_spec.zero(tensordict_reset.batch_size)
         return tensordict_reset.set(self.executed_key, idle)
+
+    def _see_to_context(self, observed: TensorDictBase) -> None:
+        """Reads it, or makes sure that what was read early is still there."""
+        if not self.context_keys:
+            return
+        if not self.reads_early:
+            self.read_raw(observed)
+        elif observed.get(self.context_key, None) is None:
+            raise KeyError(
+                f"a transform in front of the ActionMapTransform removed {self.context_key!r}, the recorded context: "
+                "put the ActionMapTransform in front of it, or let it leave that key."
+            )
 
     def __repr__(self) -> str:
         size = f"{self.map.action_dim} -> {self.map.actuation_dim}"

@@ -94,7 +94,7 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
         return cls(env, path, **kwargs)
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # a property in Gymnasium's own Wrapper too
         """What ``gymnasium.make`` makes this environment of again, wrapper and map included."""
         spec = super().spec
         if spec is None or self._map_has_a_file:
@@ -173,7 +173,7 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
         return cls(env, path, **kwargs)
 
     def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Resets the copies, or those in ``options["reset_mask"]`` (N,), and reads their context."""
         everyone = np.ones(self.num_envs, dtype=bool)

@@ -113,8 +113,9 @@ class GymnasiumMapping:
 
 def _numpy_dtype(dtype: torch.dtype) -> type[np.floating[Any]]:
     """NumPy's floats for a map's; single precision for those that NumPy lacks."""
-    kinds = {torch.float64: np.float64, torch.float16: np.float16}
-    return kinds.get(dtype, np.float32)
+    if dtype == torch.float64:
+        return np.float64
+    return np.float16 if dtype == torch.float16 else np.float32
 
 
 def _actuation_space(space: Space[Any], shape: tuple[int, ...]) -> Box:

@@ -37,6 +37,7 @@ THEIRS = {
     },
     "nht.transforms": {"tensordict", "torch", "torchrl"},
     "nht.transforms.action_map_wrapper": {"gymnasium", "numpy", "tensordict", "torch"},
+    "nht.transforms.gymnasium_mapping": {"gymnasium", "numpy", "tensordict", "torch"},
     "nht.transforms.arguments": {"tensordict", "torch"},
     "nht.envs": {
         "dm_control",

@@ -12,6 +12,7 @@ from torchrl.envs import (
     MultiAction,
     ObservationNorm,
     RenameTransform,
+    SelectTransform,
     SerialEnv,
     StepCounter,
     TransformedEnv,
@@ -201,6 +202,17 @@ def test_without_an_environment_a_chain_maps_a_policys_action():
     mapped = Compose(toy_transform()).inv(data)
     expected = toy_map()(1.5 * data["action"], data["context"])
     torch.testing.assert_close(mapped["action"], expected.detach())
+
+
+def test_the_recorded_context_must_not_be_removed():
+    env = TransformedEnv(ToyArm(), Compose(SelectTransform("joint"), toy_transform()))
+    with pytest.raises(
+        KeyError, match="removed 'context', the recorded context: put the ActionMapTransform in"
+    ):
+        env.reset()
+    selected = SelectTransform(("raw", "joint"), ("raw", "tool"), "joint", "context", "received")
+    kept = TransformedEnv(ToyArm(), Compose(selected, toy_transform()))
+    assert_mapped(kept.rollout(3))
 
 
 def test_several_actuations_at_once_have_no_context():

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.envs import Compose, ObservationNorm, TransformedEnv, check_env_specs
 
-from nht import NHT, SCL, SVD, save_map
+from nht import NHT, SCL, SVD, Demos, save_map
 from nht.transforms import ActionMapTransform
 from toy_envs import CONTEXT_KEYS, LIMIT, SCALE, ToyArm, ToyTeam, assert_mapped, toy_map, toy_transform
 
@@ -149,3 +149,26 @@ def test_keys_as_json_has_them():
     nested = ActionMapTransform(toy_map(), [["raw", "tool"], ["raw", "joint"]], action_scale=SCALE)
     assert nested.context_keys == [("raw", "tool"), ("raw", "joint")]
     assert_mapped(executed(nested))
+
+
+def test_demonstrations_of_a_rollout_through_the_map():
+    """The executed actuation stands under "next"; at the root, that of the step before is refused."""
+    data = TransformedEnv(ToyArm((3,)), toy_transform()).rollout(30, break_when_any_done=False)
+    right = Demos.from_tensordict(data, actuation_key=("next", "actuation"), context=["context", "joint"])
+    assert len(right.actuation) > 60
+    expected = toy_map()(SCALE * data["action"], data["context"]).clamp(-LIMIT, LIMIT).detach()
+    torch.testing.assert_close(right.actuation[:4], expected[0, :4], atol=1e-5, rtol=1e-5)
+    message = r"'actuation' also stands under 'next': .* actuation_key=\('next', 'actuation'\)\."
+    with pytest.raises(ValueError, match=message):
+        Demos.from_tensordict(data, actuation_key="actuation", context=["context"])
+
+
+def test_no_action_executes_the_maps_rest():
+    map = SVD(3, 2, offset="constant")
+    rest = torch.tensor([0.5, -0.2, 0.1])
+    map.fit(TensorDict(actuation=rest + 0.01 * torch.randn(50, 3), context=torch.empty(50, 0), batch_size=50))
+    env = TransformedEnv(ToyArm((2,)), ActionMapTransform(map, action_scale=9.0, saturation="scale"))
+    observed = env.reset()
+    after = env.step(observed.set("action", torch.zeros(2, 2)))["next"]
+    torch.testing.assert_close(after["actuation"], map.rest(torch.empty(2, 0)))
+    torch.testing.assert_close(after["actuation"], rest.expand(2, 3), atol=0.02, rtol=0.0)
