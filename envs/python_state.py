@@ -97,8 +97,12 @@ class PythonState:
 def _assign(part: gymnasium.Env[Any, Any], name: str, value: Any) -> None:
     """Set an attribute; an array that others may hold, too, gets new numbers instead."""
     there = vars(part).get(name)
-    both = isinstance(there, np.ndarray) and isinstance(value, np.ndarray)
-    if both and there.flags.writeable and (there.shape, there.dtype) == (value.shape, value.dtype):
+    if (
+        isinstance(there, np.ndarray)
+        and isinstance(value, np.ndarray)
+        and there.flags.writeable
+        and (there.shape, there.dtype) == (value.shape, value.dtype)
+    ):
         there[...] = value
     else:
         setattr(part, name, value)

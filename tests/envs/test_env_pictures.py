@@ -113,7 +113,12 @@ print(nht.envs.make_env("wam_wipe", seed=0).render(width=32, height=24).shape)
 @pytest.mark.parametrize(
     "display", ["", ":99", "localhost:77", "nowhere.invalid:0", "nonsense", ":", "/tmp/x:0"]
 )
-def test_a_display_that_nobody_serves(display):
+def test_displays_that_nobody_serves(display, monkeypatch):
+    monkeypatch.setenv("DISPLAY", display)
+    assert not rendering.display_answers()
+
+
+def test_without_a_display_that_answers_egl_is_taken():
     if run("import ctypes; ctypes.CDLL('libEGL.so.1')").returncode:
         pytest.skip("EGL is not installed")
     found = run(DRAW_OURS, DISPLAY=":99")

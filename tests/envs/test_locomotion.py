@@ -143,7 +143,7 @@ def test_defaults_are_gymnasiums(name):
         for key, parameter in inspect.signature(type(original(IDS[name])).__init__).parameters.items()
     }
     task = make_task(name, seed=0)
-    shared = set(theirs) & set(inspect.signature(TASKS[name]).parameters)
+    shared = set(theirs) & set(inspect.signature(TASKS[name].task_class).parameters)
     assert {"forward_reward_weight", "ctrl_cost_weight", "reset_noise_scale"} <= shared
     for key in shared:
         assert getattr(task, key) == theirs[key], key

@@ -18,32 +18,14 @@ from nht.envs.wam_kinematics import (
     tool_pose,
 )
 from nht.envs.wam_wipe import DOWN, GOAL_HIGH, GOAL_LOW, START_POSTURE, TABLE_HEIGHT, flush_posture
+from wam_play import STILL, drive, posture_at, step
 
-STILL = np.zeros(7)
 AT = np.array([0.5, 0.05, TABLE_HEIGHT])  # somewhere on the table
 X, Z = np.eye(3)[0], np.eye(3)[2]
 
 
 def make_wipe(num_envs=1, **options):
-    return make_task("wam_wipe", num_envs=num_envs, seed=0, **options)
-
-
-def step(task, actuation=STILL):
-    return task.step(np.broadcast_to(actuation, (task.num_envs, 7)))
-
-
-def posture_at(position, normal=DOWN):
-    """A posture with the tool face at ``position`` and its normal along ``normal``, by Newton's method."""
-    posture = START_POSTURE[None]
-    for _ in range(50):
-        pose = forward_kinematics(posture)
-        error = np.concatenate([position - pose.position, (normal - pose.normal)[:, :2]], axis=1)
-        jacobian = np.concatenate([pose.linear_jacobian(), pose.normal_jacobian()[:, :2]], axis=1)
-        posture = posture + damped_solve(jacobian, error)
-    reached = tool_pose(posture)
-    np.testing.assert_allclose(reached[0][0], position, atol=1e-9)
-    np.testing.assert_allclose(reached[1][0], normal, atol=1e-9)
-    return posture
+    return make_task("wam_wipe", num_envs=num_envs, **{"seed": 0} | options)
 
 
 # The arm.
@@ -342,20 +324,6 @@ def test_bad_options(options, message):
 
 
 # The expert.
-
-
-def drive(task, expert):
-    """Until every copy has been at its goal or failed: whether it succeeded, failed, and after how many steps."""
-    succeeded, failed = np.zeros((2, task.num_envs), dtype=bool)
-    length = np.zeros(task.num_envs)
-    for _ in range(task.max_episode_steps):
-        length += ~succeeded
-        outcome = task.step(expert(task.observe()))
-        succeeded |= outcome.success
-        failed |= outcome.failure
-        if (succeeded | failed).all():
-            break
-    return succeeded, failed, length
 
 
 @pytest.mark.parametrize("start", ["fixed", "random"])

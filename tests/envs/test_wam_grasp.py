@@ -5,7 +5,6 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from test_wam import STILL, drive, posture_at, step
 
 from nht.envs import make_expert, make_task
 from nht.envs.experts import arc
@@ -25,13 +24,14 @@ from nht.envs.wam_grasp import (
     grasp_posture,
 )
 from nht.envs.wam_kinematics import JOINT_HIGH, JOINT_LOW, MAX_SPEED, tool_pose
+from wam_play import STILL, drive, posture_at, step
 
 X, Z = np.eye(3)[0], np.eye(3)[2]
 BESIDE = grasp_point(np.array([0.5]), np.array([2.0]))[0]  # a grasp point
 
 
 def make_grasp(num_envs=1, **options):
-    return make_task("wam_grasp", num_envs=num_envs, seed=0, **options)
+    return make_task("wam_grasp", num_envs=num_envs, **{"seed": 0} | options)
 
 
 # Collisions.
