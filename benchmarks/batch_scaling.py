@@ -33,7 +33,7 @@ def resident():
         return next(int(line.split()[1]) for line in file if line.startswith("VmRSS")) / 1024
 
 before = resident()
-env = make_env(sys.argv[1], num_envs=int(sys.argv[2]))
+env = make_env(sys.argv[1], num_envs=int(sys.argv[2]), seed=0)
 env.rollout(10)
 print(resident() - before)
 """
@@ -44,7 +44,7 @@ def make_methods(name: str) -> list[Method]:
     for copies in COPIES:
         for threads in THREADS:
             methods.append(Method("bare", copies, threads, bare(name, copies, threads)))
-            env = make_env(name, copies, threads)
+            env = make_env(name, copies, threads, seed=0)
             methods.append(Method("TorchRL", copies, threads, torchrl(name, env, copies)))
     return methods
 

@@ -53,7 +53,7 @@ def synergies(names: list[str], rng: np.random.Generator) -> NDArray[np.float64]
 
 def hand_made_demos() -> nht.Demos:
     rng, rows = np.random.default_rng(0), []
-    with closing(make_gymnasium(TASK)) as env:
+    with closing(make_gymnasium(TASK, seed=0)) as env:
         model = env.task.copies[0].model
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nu)]
         for episode in range(EPISODES):

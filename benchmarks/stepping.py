@@ -75,7 +75,7 @@ class EnvPool(Method):
 
 
 def bare(name: str, copies: int, threads: int) -> Iterator[None]:
-    task = make_task(name, num_envs=copies)
+    task = make_task(name, num_envs=copies, seed=0)
     visited = random_motion(task)
     trajectory = np.zeros((copies, task.substeps, task.state.shape[1]))
     models, data = [task.model] * copies, [mujoco.MjData(task.model) for _ in range(threads)]
@@ -105,7 +105,7 @@ def random_actuations(task: BatchedTask, count: int) -> np.ndarray:
 
 
 def torchrl(name: str, env: EnvBase, copies: int) -> Iterator[None]:
-    drawn = random_actuations(make_task(name, num_envs=copies), 256)
+    drawn = random_actuations(make_task(name, num_envs=copies, seed=0), 256)
     actions = torch.tensor(drawn, dtype=torch.float32).unbind()
     tensordict: TensorDictBase = env.reset()
     while True:
@@ -115,7 +115,7 @@ def torchrl(name: str, env: EnvBase, copies: int) -> Iterator[None]:
 
 
 def sync_vector(name: str, copies: int) -> Iterator[None]:
-    actions = random_actuations(make_task(name, num_envs=copies), 256).astype(np.float32)
+    actions = random_actuations(make_task(name, num_envs=copies, seed=0), 256).astype(np.float32)
     make = partial(gymnasium.make, gymnasium_id(name), disable_env_checker=True)
     env = gymnasium.vector.SyncVectorEnv([make] * copies)
     env.reset(seed=0)
@@ -132,7 +132,9 @@ def gymnasium_id(name: str) -> str:
 def make_methods(name: str, envpool: str | None) -> list[Method]:
     sizes = [(copies, threads) for copies in FLOORS for threads in (1, 2)]
     methods = [Method("bare", *size, bare(name, *size)) for size in sizes]
-    methods += [Method("TorchRL", *size, torchrl(name, make_env(name, *size), size[0])) for size in sizes]
+    methods += [
+        Method("TorchRL", *size, torchrl(name, make_env(name, *size, seed=0), size[0])) for size in sizes
+    ]
     serial = SerialEnv(8, partial(GymEnv, gymnasium_id(name)))
     methods.append(Method("SyncVectorEnv", 8, 1, sync_vector(name, 8)))
     methods.append(Method("SerialEnv", 8, 1, torchrl(name, serial, 8)))

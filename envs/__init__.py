@@ -5,8 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from nht.envs.arm import Arm
 from nht.envs.gymnasium_ids import gymnasium_id, register
-from nht.envs.registry import FOREIGN, TASKS, Arm, TaskRecord, make_env, make_expert, make_task
+from nht.envs.registry import FOREIGN, TASKS, TaskRecord, make_env, make_expert, make_task
 
 if TYPE_CHECKING:
     from nht.envs.dm_control import make_dm_control
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
     from nht.envs.gymnasium_mujoco import make_gymnasium
     from nht.envs.gymnasium_vector import GymnasiumVectorEnv
     from nht.envs.mujoco_batch import BatchedMujocoEnv
+    from nht.envs.simulation import Simulation
     from nht.envs.task import BatchedTask, Outcome
+    from nht.envs.torchrl_env import make_torchrl
 
 __all__ = [
     "FOREIGN",
@@ -29,6 +32,7 @@ __all__ = [
     "GymnasiumEnv",
     "GymnasiumVectorEnv",
     "Outcome",
+    "Simulation",
     "TaskRecord",
     "gymnasium_id",
     "make_dm_control",
@@ -36,6 +40,7 @@ __all__ = [
     "make_expert",
     "make_gymnasium",
     "make_task",
+    "make_torchrl",
 ]
 
 _MODULES = {
@@ -46,8 +51,10 @@ _MODULES = {
     "GymnasiumEnv": "gymnasium_env",
     "GymnasiumVectorEnv": "gymnasium_vector",
     "Outcome": "task",
+    "Simulation": "simulation",
     "make_dm_control": "dm_control",
     "make_gymnasium": "gymnasium_mujoco",
+    "make_torchrl": "torchrl_env",
 }
 
 

@@ -7,10 +7,9 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from nht.envs.locomotion import Locomotion, Range, gymnasium_model
-from nht.envs.task import Array, Flags
+from nht.envs.task import Array, Flags, Rows
 
 # Of a contact sensor: force, torque and position (bits 1, 2 and 4), of all contacts together.
 CONTACT_FIELDS, NET_FORCE = 1 << 1 | 1 << 2 | 1 << 4, 3
@@ -50,7 +49,7 @@ class Ant(Locomotion):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         *,
         forward_reward_weight: float = 1.0,
         ctrl_cost_weight: float | None = None,
@@ -105,18 +104,18 @@ class Ant(Locomotion):
             observed["observation"] = np.concatenate(parts, axis=1)
         return observed
 
-    def _draw_start(self, rows: NDArray[np.intp]) -> None:
+    def _draw_start(self, rows: Rows) -> None:
         super()._draw_start(rows)
         self._forget_last_step(rows)
 
     def set_state(
-        self, qpos: Array, qvel: Array, rows: NDArray[np.intp] | None = None, *, tolerance: float = 0.1
+        self, qpos: Array, qvel: Array, rows: Rows | None = None, *, tolerance: float = 0.1
     ) -> None:
         """As of every task; contact forces read 0 until the next step, as in Gymnasium after a reset."""
         super().set_state(qpos, qvel, rows, tolerance=tolerance)
         self._forget_last_step(np.arange(self.num_envs) if rows is None else rows)
 
-    def _forget_last_step(self, rows: NDArray[np.intp]) -> None:
+    def _forget_last_step(self, rows: Rows) -> None:
         self.torso_x[rows] = self.qpos[rows, 0]
         self.contact_force[rows] = 0.0
 
@@ -132,63 +131,66 @@ class Ant(Locomotion):
         squares = np.einsum("ij,ij->i", self.contact_force, self.contact_force)
         return reward - self.contact_cost_weight * squares, *flags
 
-    def _advance(self, applied: Array) -> Flags:
-        diverged = super()._advance(applied)
+    def _advance(self, applied: Array, rows: Rows | None = None) -> Flags:
+        diverged = super()._advance(applied, rows)
         self._forget_last_step(np.flatnonzero(diverged))
         return diverged
 
-    def _complete(self, after: Array) -> Array:
+    def _complete(self, trajectory: Array, control: Array, rows: Rows | slice) -> Array:
         """Take the last substep by the four stages of the classical Runge-Kutta method, as MuJoCo does."""
+        after = trajectory[:, -1]
         time, q, v_1 = after[:, :1], after[:, 1 : 1 + self.model.nq], after[:, 1 + self.model.nq :]
-        step, before = self.model.opt.timestep, self._trajectory[:, -2, 1 + self.model.nq :]
-        a_1 = self._acceleration(q, v_1, guess=(v_1 - before) / step)
+        step, before = self.model.opt.timestep, trajectory[:, -2, 1 + self.model.nq :]
+        a_1 = self._acceleration(q, v_1, control, guess=(v_1 - before) / step)
         v_2 = v_1 + step / 2 * a_1
-        a_2 = self._acceleration(moved(q, v_1, step / 2), v_2, guess=a_1)
+        a_2 = self._acceleration(moved(q, v_1, step / 2), v_2, control, guess=a_1)
         v_3 = v_1 + step / 2 * a_2
-        a_3 = self._acceleration(moved(q, v_2, step / 2), v_3, guess=a_2)
+        a_3 = self._acceleration(moved(q, v_2, step / 2), v_3, control, guess=a_2)
         v_4 = v_1 + step * a_3
         q_4 = moved(q, v_3, step)
-        a_4 = self._acceleration(q_4, v_4, guess=a_3)
-        self.torso_x = q_4[:, 0].copy()
-        self.contact_force = self._external_forces().clip(*self.contact_force_range)
+        a_4 = self._acceleration(q_4, v_4, control, guess=a_3)
+        self.torso_x[rows] = q_4[:, 0]
+        self.contact_force[rows] = self._external_forces(len(q)).clip(*self.contact_force_range)
 
         position = moved(q, (v_1 + 2 * v_2 + 2 * v_3 + v_4) / 6, step)
         velocity = v_1 + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
         return np.concatenate([time + step, position, velocity], axis=1)
 
-    def _acceleration(self, q: Array, v: Array, guess: Array) -> Array:
-        """Acceleration ``(N, nv)`` of all copies at a state; leaves behind what the sensors read there.
+    def _acceleration(self, q: Array, v: Array, control: Array, guess: Array) -> Array:
+        """Acceleration ``(M, nv)`` of M copies at a state; leaves behind what the sensors read there.
 
         Args:
-            q: positions ``(N, nq)``.
-            v: velocities ``(N, nv)``.
-            guess: acceleration ``(N, nv)`` that the solver starts from.
+            q: positions ``(M, nq)``.
+            v: velocities ``(M, nv)``.
+            control: of the substeps before, ``(M, substeps, nu)``.
+            guess: acceleration ``(M, nv)`` that the solver starts from.
         """
         assert self._rollout is not None
-        time = np.ones((self.num_envs, 1))
+        count = len(q)
+        time = np.ones((count, 1))
         self._rollout.rollout(
-            [self._sensing] * self.num_envs,
+            [self._sensing] * count,
             self._sensing_data,
             np.concatenate([time, q, v], axis=1),
-            self._control[:, :1].copy(),
+            control[:, :1].copy(),
             control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
             skip_checks=True,
             nstep=1,
             initial_warmstart=guess,
-            state=self._after,
-            sensordata=self._sensed,
+            state=self._after[:count],
+            sensordata=self._sensed[:count],
         )
-        after = self._after[:, 0]
+        after = self._after[:count, 0]
         acceleration = (after[:, -v.shape[1] :] - v) / self.model.opt.timestep
         acceleration[after[:, 0] < 1] = math.nan  # MuJoCo answers bad numbers by a reset, of the clock too
         return acceleration
 
-    def _external_forces(self) -> Array:
-        """MuJoCo's ``cfrc_ext``: torque about the robot's centre of mass and force on each body, ``(N, 6 bodies)``."""
-        centre, contacts = self._sensed[:, 0, :3], self._sensed[:, 0, 3:].reshape(self.num_envs, -1, 9)
+    def _external_forces(self, count: int) -> Array:
+        """MuJoCo's ``cfrc_ext``: torque about the robot's centre of mass and force on each body, ``(M, 6 bodies)``."""
+        centre, contacts = self._sensed[:count, 0, :3], self._sensed[:count, 0, 3:].reshape(count, -1, 9)
         force, torque, point = np.split(contacts, 3, axis=2)
         about_centre = torque + np.cross(point - centre[:, None], force)
-        return np.concatenate([about_centre, force], axis=2).reshape(self.num_envs, -1)
+        return np.concatenate([about_centre, force], axis=2).reshape(count, -1)
 
 
 def sensing_model(file: str) -> mujoco.MjModel:

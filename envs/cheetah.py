@@ -34,7 +34,12 @@ class CheetahRun(SuiteTask):
     """
 
     def __init__(
-        self, num_envs: int = 1, num_threads: int = 1, seed: int = 0, *, max_episode_steps: int = 1_000
+        self,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        seed: int | None = None,
+        *,
+        max_episode_steps: int = 1_000,
     ) -> None:
         xml, assets = suite_module("cheetah").get_model_and_assets()
         super().__init__(

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torchrl.data import Bounded
-from torchrl.envs import DMControlEnv, EnvBase
+import numpy as np
+from numpy.typing import NDArray
 
-from nht.envs.foreign import ForeignEnv, MujocoCopy
-from nht.envs.task import Array
+if TYPE_CHECKING:
+    import torch
+    from torchrl.envs import EnvBase
+
+    from nht.envs.foreign import ForeignEnv
+
+Array = NDArray[np.float64]
 
 
 def make_dm_control(
-    name: str, num_envs: int = 1, seed: int = 0, device: torch.device | str = "cpu", **options: Any
+    name: str, num_envs: int = 1, seed: int | None = None, device: torch.device | str = "cpu", **options: Any
 ) -> ForeignEnv:
     """Copies of a task of dm_control's suite.
 
     Args:
         name: domain and task, ``"cheetah-run"``.
         num_envs: number of copies.
-        seed: seed of every random draw of the task.
+        seed: seed of every random draw of the task; None draws one, so that no two environments are alike.
         device: where the tensors go.
         options: arguments of the task itself, e.g. ``time_limit=20`` [s].
 
@@ -30,7 +34,10 @@ def make_dm_control(
         ValueError: for an unknown domain or task; the message lists those that exist.
     """
     domain, task = _domain_and_task(name)
-    return ForeignEnv(partial(_suite_env, domain, task, options), SuiteCopy, num_envs, seed, device)
+    from nht.envs.foreign import ForeignEnv
+    from nht.envs.suite_copy import SuiteCopy
+
+    return ForeignEnv(partial(_suite_env, domain, task, options), SuiteCopy, num_envs, seed, device, name)
 
 
 def suite_module(domain: str) -> Any:
@@ -67,32 +74,7 @@ def _domain_and_task(name: str) -> tuple[str, str]:
 
 
 def _suite_env(domain: str, task: str, options: dict[str, Any]) -> EnvBase:
+    from torchrl.envs import DMControlEnv
+
     # What a task draws when it is built, lqr its springs, is the same in all copies and runs.
-    env = DMControlEnv(domain, task, **({"random": 0} | options))
-    if domain != "lqr":  # alone in the suite its rewards have no such bounds
-        env.reward_spec = Bounded(0.0, 1.0, shape=(1,), dtype=torch.float64)
-    return env
-
-
-class SuiteCopy(MujocoCopy):
-    """The simulator behind one ``DMControlEnv``."""
-
-    def __init__(self, env: EnvBase) -> None:
-        self._env = env._env  # dm_control's own
-        self.model, self.data = self._env.physics.model.ptr, self._env.physics.data.ptr
-        self.time_per_step = self._env.control_timestep()
-        self.max_episode_steps = self._env._step_limit
-
-    def progress(self) -> dict[str, Any]:
-        """Generator and clock."""
-        return {
-            "random": self._env.task.random.get_state(legacy=False),
-            "steps": self._env._step_count,
-            "ended": self._env._reset_next_step,
-        }
-
-    def set_progress(self, saved: dict[str, Any]) -> None:
-        """Go on from what ``progress`` returned."""
-        self._env.task.random.set_state(saved["random"])
-        self._env._step_count = saved["steps"]
-        self._env._reset_next_step = saved["ended"]
+    return DMControlEnv(domain, task, **({"random": 0} | options))

@@ -11,8 +11,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from nht.envs.pictures import Pictures
 from nht.envs.registry import make_task
-from nht.envs.rendering import SceneRenderer
+from nht.envs.simulation import DEFAULT_SIZE
 from nht.envs.task import BatchedTask
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"]}
@@ -26,9 +27,14 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     It truncates only if ``options`` has ``max_episode_steps``: ``gymnasium.make`` adds the task's time limit, or its
     own ``max_episode_steps`` in its place. None is the task's own limit.
 
+    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+
     Args:
         task: a key of ``nht.envs.TASKS``.
         render_mode: ``"rgb_array"``, or None.
+        width: of a picture [pixel].
+        height: of a picture [pixel].
+        camera: name or number of a camera of the model; None is the first one.
         options: further arguments of the task.
 
     Raises:
@@ -38,7 +44,15 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata = METADATA
     spec: EnvSpec | None
 
-    def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(
+        self,
+        task: str,
+        render_mode: str | None = None,
+        width: int = DEFAULT_SIZE[0],
+        height: int = DEFAULT_SIZE[1],
+        camera: str | int | None = None,
+        **options: Any,
+    ) -> None:
         check_render_mode(render_mode)
         # Gymnasium's rule: without a seed, every environment draws its own.
         options.setdefault("seed", int(self.np_random.integers(2**31)))
@@ -49,7 +63,8 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.metadata = metadata_of(self.task)
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces_of(self.task)
-        self._renderer: SceneRenderer | None = None
+        self._view = (width, height, camera)
+        self._pictures = Pictures(self.task)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -78,16 +93,11 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """The scene as ``(height, width, 3)`` in ``rgb_array`` mode."""
-        if self.render_mode is None:
-            return None
-        self._renderer = self._renderer or SceneRenderer(self.task)
-        return self._renderer.frame(row=0)
+        return None if self.render_mode is None else self._pictures.take(*self._view)[0]
 
     def close(self) -> None:
         """Release the renderer and the native threads. A second call does nothing."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._pictures.close()
         self.task.close()
 
 

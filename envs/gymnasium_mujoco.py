@@ -1,45 +1,60 @@
-"""Gymnasium's MuJoCo environments through TorchRL's ``GymEnv``, the Adroit hand of Gymnasium-Robotics among them."""
+"""Gymnasium's environments through TorchRL's ``GymEnv``, on MuJoCo or not."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from typing import Any
 
 import gymnasium
+import numpy as np
 import torch
-from tensordict import TensorDictBase
-from torchrl.data import Binary, TensorSpec
 from torchrl.envs import EnvBase, GymEnv
-from torchrl.envs.gym_like import BaseInfoDictReader
 
-from nht.envs.foreign import ForeignEnv, MujocoCopy
+from nht.envs.foreign import FLAGS, ForeignEnv
+from nht.envs.gymnasium_copies import GymnasiumCopy, InfoReader, NativeCopy, gymnasium_copy
 
 
 def make_gymnasium(
-    name: str, num_envs: int = 1, seed: int = 0, device: torch.device | str = "cpu", **options: Any
+    name: str,
+    num_envs: int = 1,
+    seed: int | None = None,
+    device: torch.device | str = "cpu",
+    *,
+    info_keys: Sequence[str] = (),
+    **options: Any,
 ) -> ForeignEnv:
-    """Copies of a MuJoCo environment that ``gymnasium.make`` knows, or that Gymnasium-Robotics brings.
+    """Copies of an environment that ``gymnasium.make`` knows, or that Gymnasium-Robotics brings.
+
+    Its actions must be a vector of numbers, and so must its observations, or the entries of a Dict of them. Those on
+    MuJoCo, our own, and those that consist of plain Python values can be saved; of others ``task.resume_obstacle`` says
+    why not.
 
     Args:
         name: its id, ``"AdroitHandRelocate-v1"``.
         num_envs: number of copies.
-        seed: seed of every random draw of the environment.
+        seed: seed of every random draw of the environment; None draws one, so that no two environments are alike.
         device: where the tensors go.
+        info_keys: entries of ``info``, numbers or vectors, that become observations beside ``"observation"``, for the
+            context of maps. Of our own tasks the raw keys are there anyway.
         options: further arguments of ``gymnasium.make``.
 
     Raises:
         ImportError: if the environment is one of Gymnasium-Robotics, which is not installed.
-        ValueError: for an id that does not exist, with some that do, and for environments without MuJoCo.
+        KeyError: if a reset's ``info`` lacks one of the ``info_keys``.
+        ValueError: for an id that does not exist, with some that do; for actions or observations of other kinds.
     """
     _check_id(name)
-    return ForeignEnv(partial(_gym_env, name, options), GymnasiumCopy, num_envs, seed, device)
+    return ForeignEnv(
+        partial(_gym_env, name, tuple(info_keys), options), gymnasium_copy, num_envs, seed, device, name
+    )
 
 
 def _check_id(name: str) -> None:
-    if name not in gymnasium.registry:
+    if name not in gymnasium.registry and ":" not in name:
         _register_robotics(needed="Adroit" in name)
-    if name not in gymnasium.registry:
+    if name not in gymnasium.registry and ":" not in name:
         first = name[:5].lower()
         similar = sorted(each for each in gymnasium.registry if each.lower().startswith(first))
         raise ValueError(f"gymnasium has no environment {name!r}; with similar names it has {similar}.")
@@ -55,52 +70,28 @@ def _register_robotics(needed: bool) -> None:
     gymnasium.register_envs(gymnasium_robotics)
 
 
-def _gym_env(name: str, options: dict[str, Any]) -> EnvBase:
+def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> EnvBase:
     env = GymEnv(name, **options)
-    if not hasattr(env._env.unwrapped, "data"):
-        raise ValueError(f"{name} is no MuJoCo environment: its simulator could be neither saved nor drawn.")
-    return env.set_info_dict_reader(SuccessReader())
+    copy = gymnasium_copy(env)
+    drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
+        "render_modes", []
+    )
+    if drawn_by_itself and "render_mode" not in options:
+        env.close()
+        env = GymEnv(name, **options, render_mode="rgb_array")
+        copy = gymnasium_copy(env)
+    if isinstance(copy, NativeCopy):
+        sizes = {key: size for key, size in copy.task.observation_sizes.items() if key != "observation"}
+        return env.set_info_dict_reader(InfoReader(FLAGS, sizes))
+    return env.set_info_dict_reader(InfoReader(("success",), _sizes(name, info_keys, options)))
 
 
-class SuccessReader(BaseInfoDictReader):
-    """Takes ``info["success"]``, where there is one; TorchRL's own reader stumbles over Python's bools."""
-
-    def __call__(self, info_dict: dict[str, Any], tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``"success"`` ``(1,)``."""
-        return tensordict.set("success", torch.tensor([bool(info_dict.get("success", False))]))
-
-    @property
-    def info_spec(self) -> dict[str, TensorSpec]:
-        """What is written."""
-        return {"success": Binary(n=1, shape=(1,), dtype=torch.bool)}
-
-
-class GymnasiumCopy(MujocoCopy):
-    """The simulator behind one ``GymEnv``."""
-
-    def __init__(self, env: EnvBase) -> None:
-        self._env = env._env  # Gymnasium's own, in its wrappers
-        self._core = self._env.unwrapped
-        self.model, self.data = self._core.model, self._core.data
-        self.time_per_step = self._core.dt
-        self._clock = _time_limit(self._env)
-        self.max_episode_steps = math.inf if self._clock is None else self._clock._max_episode_steps
-
-    def progress(self) -> dict[str, Any]:
-        """Generator and clock."""
-        steps = None if self._clock is None else self._clock._elapsed_steps
-        return {"random": self._core.np_random.bit_generator.state, "steps": steps}
-
-    def set_progress(self, saved: dict[str, Any]) -> None:
-        """Go on from what ``progress`` returned."""
-        self._core.np_random.bit_generator.state = saved["random"]
-        if self._clock is not None:
-            self._clock._elapsed_steps = saved["steps"]
-
-
-def _time_limit(env: gymnasium.Env[Any, Any]) -> gymnasium.wrappers.TimeLimit[Any, Any] | None:
-    while isinstance(env, gymnasium.Wrapper):
-        if isinstance(env, gymnasium.wrappers.TimeLimit):
-            return env
-        env = env.env
-    return None
+def _sizes(name: str, keys: Sequence[str], options: dict[str, Any]) -> dict[str, int]:
+    """How long the entries of ``info`` are that a reset brings: of an environment of its own."""
+    if not keys:
+        return {}
+    with closing(gymnasium.make(name, **options)) as env:
+        _, info = env.reset()
+    if missing := [key for key in keys if key not in info]:
+        raise KeyError(f"the info of {name} lacks {missing} after a reset; it has {list(info)}.")
+    return {key: np.size(info[key]) for key in keys}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from nht.envs.gymnasium_env import FLAGS, check_render_mode, metadata_of, spaces_of
+from nht.envs.pictures import Pictures
 from nht.envs.registry import make_task
-from nht.envs.rendering import SceneRenderer
+from nht.envs.simulation import DEFAULT_SIZE
 from nht.envs.task import Array, Flags
 
 Observations = NDArray[np.float32]
@@ -22,9 +23,9 @@ Observations = NDArray[np.float32]
 class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[Any]]):
     """N copies of a task that one native call steps together, with what ``SyncVectorEnv`` returns.
 
-    One generator draws for all copies, so that one seed repeats them. ``infos`` holds arrays with N rows: the flags
-    ``success``, ``failure`` and ``diverged`` and the task's raw keys; a mask ``_key`` beside each names the rows that
-    are of this call. What is returned belongs to the caller.
+    One generator draws for all copies, so that one seed repeats them, or a list of one for each. ``infos`` holds
+    arrays with N rows: the flags ``success``, ``failure`` and ``diverged`` and the task's raw keys; a mask ``_key``
+    beside each names the rows that are of this call. What is returned belongs to the caller.
 
     A copy whose episode has ended is started anew as ``autoreset_mode`` says:
 
@@ -33,11 +34,16 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
     - ``DISABLED``: by ``reset(options={"reset_mask": mask})``, which leaves the other copies alone. The other modes
       take it, too.
 
+    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+
     Args:
         task: a key of ``nht.envs.TASKS``.
         num_envs: number of copies N.
         render_mode: ``"rgb_array"``, or None.
-        autoreset_mode: an ``AutoresetMode`` or its value, e.g. ``"SameStep"``.
+        autoreset_mode: an ``AutoresetMode``, or its name or value: ``"SAME_STEP"``, ``"same_step"``, ``"SameStep"``.
+        width: of a picture [pixel].
+        height: of a picture [pixel].
+        camera: name or number of a camera of the model; None is the first one.
         options: further arguments of the task, e.g. ``num_threads=2``.
 
     Raises:
@@ -50,6 +56,9 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
         num_envs: int = 1,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        width: int = DEFAULT_SIZE[0],
+        height: int = DEFAULT_SIZE[1],
+        camera: str | int | None = None,
         **options: Any,
     ) -> None:
         check_render_mode(render_mode)
@@ -65,30 +74,35 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended: Flags | None = None  # copies that wait for a reset; None before the first one
-        self._renderer: SceneRenderer | None = None
+        self._view = (width, height, camera)
+        self._pictures = Pictures(self.task)
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start episodes; a seed makes them and those after them repeatable.
 
         Args:
-            seed: of the generator that all copies share.
+            seed: of the generator that all copies share; or N seeds, one for each copy, which starts where a single
+                environment with this seed does. A copy whose seed is None starts anywhere. Later episodes come from
+                the shared generator, which then begins with all these seeds together; if one is None, it goes on.
             options: ``"reset_mask"`` ``(N,)`` bool names the copies to reset; all by default.
 
         Raises:
-            TypeError: if the seed is no number, or the mask no array of bool.
-            ValueError: if the mask has another shape, or names no copy.
+            TypeError: if a seed is no integer, or the mask no array of bool.
+            ValueError: if there are not N seeds, or the mask has another shape or names no copy.
         """
-        if seed is not None and not isinstance(seed, int | np.integer):
-            raise TypeError(f"one seed serves all {self.num_envs} copies: it must be an int, got {seed!r}.")
+        seeds = self._checked_seeds(seed)
         everyone = np.ones(self.num_envs, dtype=bool)
         mask = (options or {}).get("reset_mask", everyone)
         self._check_mask(mask)
-        super().reset(seed=None if seed is None else int(seed))
-        if seed is not None:
-            self.task.seed(int(seed))
-        self.task.reset(np.flatnonzero(mask))
+        if isinstance(seeds, list):
+            self._start_from(seeds, mask)
+        else:
+            super().reset(seed=seeds)
+            if seeds is not None:
+                self.task.seed(seeds)
+            self.task.reset(np.flatnonzero(mask))
         self._ended = ~mask & (everyone if self._ended is None else self._ended)
         observations, raw = self._observe()
         off = {name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS}
@@ -105,8 +119,11 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
             ValueError: if ``actions`` has another shape.
         """
         resetting = self._waiting()
-        outcome = self.task.step(np.asarray(actions, dtype=np.float64))
-        if resetting.any():  # these were stepped along, from where they ended
+        some = resetting.any()
+        outcome = self.task.step(
+            np.asarray(actions, dtype=np.float64), np.flatnonzero(~resetting) if some else None
+        )
+        if some:
             self.task.reset(np.flatnonzero(resetting))
         rewards = np.where(resetting, 0.0, outcome.reward)
         terminations, truncations = outcome.terminated & ~resetting, outcome.truncated & ~resetting
@@ -147,6 +164,32 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
         values = {key: value.astype(np.float32) for key, value in self.task.observe().items()}
         return values.pop("observation"), values
 
+    def _checked_seeds(self, seed: Any) -> int | list[int | None] | None:
+        if seed is None or isinstance(seed, int | np.integer):
+            return None if seed is None else int(seed)
+        given = seed.tolist() if isinstance(seed, np.ndarray) else seed
+        if not isinstance(given, list | tuple) or not all(
+            each is None or isinstance(each, int | np.integer) for each in given
+        ):
+            raise TypeError(f"seed must be an int, or {self.num_envs} of them, got {seed!r}.")
+        if len(given) != self.num_envs:
+            raise ValueError(
+                f"seed must be one int, or one for each of the {self.num_envs} copies, got {len(given)}."
+            )
+        return [None if each is None else int(each) for each in given]
+
+    def _start_from(self, seeds: list[int | None], mask: Flags) -> None:
+        """Start the copies of the mask, each from its own seed."""
+        shared = self.task.rng
+        for row in np.flatnonzero(mask):
+            if seeds[row] is None:
+                self.task.rng = shared
+            else:
+                self.task.seed(seeds[row])
+            self.task.reset(np.array([row]))
+        given = [each for each in seeds if each is not None]
+        self.task.rng = shared if len(given) < len(seeds) else np.random.default_rng(given)
+
     def _check_mask(self, mask: Any) -> None:
         if not isinstance(mask, np.ndarray) or mask.dtype != bool:
             kind = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
@@ -158,16 +201,11 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture ``(height, width, 3)`` of every copy in ``rgb_array`` mode."""
-        if self.render_mode is None:
-            return None
-        self._renderer = self._renderer or SceneRenderer(self.task)
-        return tuple(self._renderer.frame(row) for row in range(self.num_envs))
+        return None if self.render_mode is None else tuple(self._pictures.take(*self._view))
 
     def close_extras(self, **_: Any) -> None:
         """Release the renderer and the native threads; ``close`` calls this once."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._pictures.close()
         self.task.close()
 
 
@@ -177,8 +215,11 @@ def _with_masks(values: Mapping[str, Any], rows: Flags) -> dict[str, Any]:
 
 
 def _as_mode(mode: AutoresetMode | str) -> AutoresetMode:
-    try:
-        return AutoresetMode(mode)
-    except ValueError as error:
-        allowed = [mode.value for mode in AutoresetMode]
-        raise ValueError(f"autoreset_mode must be one of {allowed}, got {mode!r}.") from error
+    if isinstance(mode, AutoresetMode):
+        return mode
+    known = {each.value.lower(): each for each in AutoresetMode}
+    plain = str(mode).replace("_", "").replace("-", "").lower()
+    if plain not in known:
+        allowed = [each.value for each in AutoresetMode]
+        raise ValueError(f"autoreset_mode must be one of {allowed}, or its name, got {mode!r}.")
+    return known[plain]

@@ -45,7 +45,12 @@ class BringBall(SuiteTask):
     _episode_arrays: ClassVar[tuple[str, ...]] = ("target", "sensors")
 
     def __init__(
-        self, num_envs: int = 1, num_threads: int = 1, seed: int = 0, *, max_episode_steps: int = 1_000
+        self,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        seed: int | None = None,
+        *,
+        max_episode_steps: int = 1_000,
     ) -> None:
         xml, assets = suite_module("manipulator").make_model(use_peg=False, insert=False)
         super().__init__(

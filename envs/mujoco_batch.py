@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,17 +9,25 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
-from nht.envs.task import BatchedTask
+from nht.envs.pictures import Pictures, check_mode
+from nht.envs.simulation import DEFAULT_SIZE
+from nht.envs.task import BatchedTask, Rows
+from nht.envs.torchrl_internals import WholeSteps, packed
 
 
-class BatchedMujocoEnv(EnvBase):
+class BatchedMujocoEnv(WholeSteps):
     """A TorchRL environment of batch size ``[N]`` whose N copies one native call steps together.
 
     Reads ``"action"`` ``(N, n)``, the actuation; writes the task's observations (float32), ``"reward"`` and the
     flags ``"done"``, ``"terminated"``, ``"truncated"``, ``"success"``, ``"failure"`` and ``"diverged"``, each
-    ``(N, 1)``. Partial resets touch only the rows that ``"_reset"`` names.
+    ``(N, 1)``. Partial resets touch only the rows that ``"_reset"`` names, partial steps only those that ``"_step"``
+    names: the others show what they showed, with the reward 0.
+
+    It can be copied and pickled, so that instances can be handed to the workers of collectors; pictures are taken anew.
+
+    The reward's spec has no bounds, for transforms such as ``RewardSum`` take it for that of what they make of rewards:
+    ``task.reward_range`` has them.
 
     Args:
         task: the copies to step.
@@ -31,6 +38,7 @@ class BatchedMujocoEnv(EnvBase):
         super().__init__(device=device, batch_size=[task.num_envs])
         self.task = task
         self._make_specs()
+        self._pictures = Pictures(task)
 
     def _make_specs(self) -> None:
         batch, device = self.batch_size, self.device
@@ -43,22 +51,15 @@ class BatchedMujocoEnv(EnvBase):
         }
         flags = {name: flag.clone() for name in ("success", "failure", "diverged")}
         self.observation_spec = Composite({**observations, **flags}, shape=batch)
-        self.reward_spec = self._reward_spec()
+        self.reward_spec = Unbounded((*batch, 1), dtype=torch.float32, device=device)
         self.done_spec = Composite(
             {name: flag.clone() for name in ("done", "terminated", "truncated")}, shape=batch
         )
 
-    def _reward_spec(self) -> Bounded | Unbounded:
-        low, high = self.task.reward_range
-        shape = (*self.batch_size, 1)
-        if math.isinf(low) or math.isinf(high):
-            return Unbounded(shape, dtype=torch.float32, device=self.device)
-        return Bounded(low, high, shape, dtype=torch.float32, device=self.device)
-
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         rows = None
         if tensordict is not None and (mask := tensordict.get("_reset", None)) is not None:
-            rows = np.flatnonzero(mask.view(-1).cpu().numpy())
+            rows = _rows(mask)
         self.task.reset(rows)
         off = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         names = ("done", "terminated", "truncated", "success", "failure", "diverged")
@@ -66,7 +67,9 @@ class BatchedMujocoEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actuation = tensordict.get("action").detach()
-        outcome = self.task.step(actuation.to("cpu", torch.float64).numpy())
+        mask = tensordict.get("_step", None)
+        rows = None if mask is None or mask.all() else _rows(mask)
+        outcome = self.task.step(actuation.to("cpu", torch.float64).numpy(), rows)
         flags = {
             "done": outcome.terminated | outcome.truncated,
             "terminated": outcome.terminated,
@@ -79,10 +82,6 @@ class BatchedMujocoEnv(EnvBase):
         reward = self._tensor(outcome.reward[:, None].astype(np.float32))
         return self._pack(self._observations() | entries | {"reward": reward})
 
-    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        # TorchRL would look for missing flags and wrong shapes: `_step` writes all of them, and right.
-        return next_tensordict_out
-
     def _observations(self) -> dict[str, torch.Tensor]:
         return {key: self._tensor(values.astype(np.float32)) for key, values in self.task.observe().items()}
 
@@ -91,13 +90,41 @@ class BatchedMujocoEnv(EnvBase):
 
     def _pack(self, entries: dict[str, torch.Tensor]) -> TensorDict:
         # Shapes and devices are ours: checking them again would cost more than the packing.
-        return TensorDict._new_unsafe(entries, batch_size=self.batch_size, device=self.device)
+        return packed(entries, self.batch_size, self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.task.seed(seed)
 
+    def render(
+        self,
+        mode: str = "rgb_array",
+        width: int = DEFAULT_SIZE[0],
+        height: int = DEFAULT_SIZE[1],
+        camera: str | int | None = None,
+    ) -> NDArray[np.uint8]:
+        """A picture of every copy as it stands now, ``(N, height, width, 3)``: what ``PixelRenderTransform`` asks for.
+
+        Args:
+            mode: ``"rgb_array"``, as other environments call it.
+            width: of a picture [pixel].
+            height: of a picture [pixel].
+            camera: name or number of a camera of the model; None is the first one.
+
+        Raises:
+            RuntimeError: if this machine has no OpenGL for offscreen rendering; the message says what to install.
+            ValueError: for another mode, or if the model has no such camera.
+        """
+        check_mode(mode)
+        return self._pictures.take(width, height, camera)
+
     def close(self, *, raise_if_closed: bool = False) -> None:
-        """Release the native threads. A second call does nothing."""
+        """Release renderers and native threads. A second call does nothing."""
+        self._pictures.close()
         self.task.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def _rows(mask: torch.Tensor) -> Rows:
+    """The indices of the copies that a mask ``(N,)`` or ``(N, 1)`` names."""
+    return np.flatnonzero(mask.view(-1).cpu().numpy())

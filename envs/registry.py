@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nht.envs.arm import Arm
 from nht.envs.table import Table, imported
 
 if TYPE_CHECKING:
@@ -18,21 +19,6 @@ if TYPE_CHECKING:
     from nht.envs.task import BatchedTask
 
 GOLDEN = Path(__file__).parent / "assets" / "golden"
-
-
-@dataclass(frozen=True)
-class Arm:
-    """A serial arm with revolute joints: Denavit-Hartenberg parameters, joint by joint, in the standard convention.
-
-    Attributes:
-        lengths: a [m].
-        twists: alpha [rad].
-        offsets: d [m]; the last one reaches to the tool.
-    """
-
-    lengths: tuple[float, ...]
-    twists: tuple[float, ...]
-    offsets: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -140,6 +126,7 @@ TASKS: Table[TaskRecord] = Table(
 FOREIGN: Mapping[str, str] = {
     "dm_control": "nht.envs.dm_control:make_dm_control",
     "gymnasium": "nht.envs.gymnasium_mujoco:make_gymnasium",
+    "torchrl": "nht.envs.torchrl_env:make_torchrl",
 }
 """Where the makers of other libraries' tasks are, by the name of the library."""
 
@@ -190,7 +177,7 @@ def make_env(
     name: str,
     num_envs: int = 1,
     num_threads: int = 1,
-    seed: int = 0,
+    seed: int | None = None,
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> BatchedMujocoEnv:
@@ -200,7 +187,7 @@ def make_env(
         name: a key of ``TASKS``, e.g. ``"wam_wipe"``, or an import path, ``"my_package.tasks:Pour"``.
         num_envs: number of copies N, the environment's batch size.
         num_threads: native threads that share the copies.
-        seed: seed of every random draw of the task.
+        seed: seed of every random draw of the task; None draws one, so that no two environments are alike.
         device: where the tensors go.
         options: further arguments of the task, e.g. ``start="random"``.
 

@@ -5,17 +5,24 @@ from __future__ import annotations
 import atexit
 import importlib
 import os
+import socket
 import sys
 import weakref
+from collections.abc import Callable
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Protocol
 
+import gymnasium
 import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
-from nht.envs.foreign import ForeignTask
-from nht.envs.task import Array, BatchedTask
+from nht.envs.simulation import DEFAULT_SIZE
+
+if TYPE_CHECKING:
+    from nht.envs.foreign import ForeignTask
+    from nht.envs.task import Array, BatchedTask
 
 LINE = np.array([0.15, 0.35, 0.85, 0.9], dtype=np.float32)  # red, green, blue, opacity
 
@@ -27,15 +34,22 @@ class SceneRenderer:
         task: the task to look at.
         width: picture width [pixel].
         height: picture height [pixel].
-        camera: name of a camera in the model.
+        camera: name or number of a camera of the model.
 
     Raises:
         RuntimeError: if this machine has no OpenGL for offscreen rendering; the message says what to install.
+        ValueError: if the model has no such camera.
     """
 
-    def __init__(self, task: BatchedTask, width: int = 640, height: int = 480, camera: str | int = 0) -> None:
+    def __init__(
+        self,
+        task: BatchedTask,
+        width: int = DEFAULT_SIZE[0],
+        height: int = DEFAULT_SIZE[1],
+        camera: str | int = 0,
+    ) -> None:
         self.task = task
-        self.camera = camera
+        self.camera = _checked_camera(task.model, camera)
         self._data = mujoco.MjData(task.model)
         self._renderer = _open_renderer(task.model, width, height)
 
@@ -60,34 +74,168 @@ class SceneRenderer:
         self._renderer.close()
 
 
+class CopyRenderer(Protocol):
+    """Takes pictures of one copy of an environment of another library."""
+
+    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The copy as it stands now, ``(height, width, 3)``; ``trail`` as of ``Renderer``."""
+
+    def close(self) -> None:
+        """Release what drawing needs."""
+
+
 class ForeignRenderer:
-    """Renders copies of an environment of another library, each with its own model: they may differ.
+    """Renders copies of an environment of another library, each on its own: their models may differ.
 
     Args:
         task: the simulators to look at.
         width: picture width [pixel].
         height: picture height [pixel].
+        camera: name or number of a camera, where there is a choice; None is the first one.
+
+    Raises:
+        RuntimeError: if the environment, or this machine, cannot draw; the message says what is missing.
+        ValueError: if there is no such camera.
+    """
+
+    def __init__(
+        self,
+        task: ForeignTask,
+        width: int = DEFAULT_SIZE[0],
+        height: int = DEFAULT_SIZE[1],
+        camera: str | int | None = None,
+    ) -> None:
+        self._renderers = [copy.renderer(width, height, camera) for copy in task.copies]
+
+    def frame(self, row: int = 0, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The copy ``row`` as it stands now; as of ``SceneRenderer``."""
+        return self._renderers[row].frame(trail)
+
+    def close(self) -> None:
+        """Release the renderers of all copies."""
+        for renderer in self._renderers:
+            renderer.close()
+
+
+class MujocoRenderer:
+    """Renders a simulator of MuJoCo, whoever steps it, through the model's first camera or another one of its own.
+
+    Args:
+        model: of the simulator.
+        data: the state to draw.
+        width: picture width [pixel].
+        height: picture height [pixel].
+        camera: name or number of a camera of the model; None is the first one, or the free one if it has none.
 
     Raises:
         RuntimeError: if this machine has no OpenGL for offscreen rendering; the message says what to install.
+        ValueError: if the model has no such camera.
     """
 
-    def __init__(self, task: ForeignTask, width: int = 640, height: int = 480) -> None:
-        self.task = task
-        self._renderers = [_open_renderer(copy.model, width, height) for copy in task.copies]
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        width: int,
+        height: int,
+        camera: str | int | None = None,
+    ) -> None:
+        self.camera = (0 if model.ncam else -1) if camera is None else _checked_camera(model, camera)
+        self._data = data
+        self._renderer = _open_renderer(model, width, height)
 
-    def frame(self, row: int = 0, trail: Array | None = None) -> NDArray[np.uint8]:
-        """The copy ``row`` as it stands now, through the model's first camera; else as of ``SceneRenderer``."""
-        copy, renderer = self.task.copies[row], self._renderers[row]
-        renderer.update_scene(copy.data, camera=0 if copy.model.ncam else -1)
+    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The simulator as it stands now, ``(height, width, 3)``."""
+        self._renderer.update_scene(self._data, camera=self.camera)
         if trail is not None:
-            _draw_line(renderer.scene, trail)
-        return renderer.render()
+            _draw_line(self._renderer.scene, trail)
+        return self._renderer.render()
 
     def close(self) -> None:
-        """Release the OpenGL contexts."""
-        for renderer in self._renderers:
-            renderer.close()
+        """Release the OpenGL context."""
+        self._renderer.close()
+
+
+class NativeRenderer:
+    """Renders the one copy of a task of ours that Gymnasium made.
+
+    Args:
+        renderer: of the task.
+    """
+
+    def __init__(self, renderer: SceneRenderer) -> None:
+        self._renderer = renderer
+
+    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The copy as it stands now, ``(height, width, 3)``."""
+        return self._renderer.frame(0, trail)
+
+    def close(self) -> None:
+        """Release the OpenGL context."""
+        self._renderer.close()
+
+
+class OwnRenderer:
+    """Takes the pictures that an environment draws itself, and brings them to one size. Trails are left out.
+
+    Args:
+        draw: draws the environment as it stands now, ``(h, w, 3)``.
+        width: picture width [pixel].
+        height: picture height [pixel].
+        camera: there is no choice: None, or 0.
+
+    Raises:
+        ValueError: for another camera.
+    """
+
+    def __init__(
+        self, draw: Callable[[], Any], width: int, height: int, camera: str | int | None = None
+    ) -> None:
+        if camera not in (None, 0):
+            raise ValueError(f"the environment draws itself, through no other camera, got {camera!r}.")
+        self._draw = draw
+        self._size = (height, width)
+
+    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
+        """The environment as it stands now, ``(height, width, 3)``.
+
+        Raises:
+            RuntimeError: if it draws something else, or lacks a package for it; the message says what is missing.
+        """
+        try:
+            picture = self._draw()
+        except gymnasium.error.DependencyNotInstalled as error:
+            raise RuntimeError(f"the environment cannot be drawn: {error}") from error
+        picture = np.asarray(picture)
+        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+            raise RuntimeError(
+                f"the environment drew no picture (height, width, 3), but {picture.shape} of {picture.dtype}."
+            )
+        return resized(picture, self._size)
+
+    def close(self) -> None:
+        """Nothing to release: the environment's own drawing ends with it."""
+
+
+def resized(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A picture ``(h, w, 3)`` brought to another height and width, each pixel an average."""
+    if picture.shape[:2] == size:
+        return picture.copy()
+    import torch
+
+    colours = torch.from_numpy(picture.copy()).permute(2, 0, 1)[None].float()
+    drawn = torch.nn.functional.interpolate(colours, size=size, mode="bilinear", antialias=True)
+    return drawn[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _checked_camera(model: mujoco.MjModel, camera: str | int) -> str | int:
+    names = [model.camera(i).name for i in range(model.ncam)]
+    known = camera in names if isinstance(camera, str) else -1 <= camera < max(model.ncam, 1)
+    if not known:
+        raise ValueError(
+            f"the model has no camera {camera!r}: choose from {names}, or a number below {model.ncam}."
+        )
+    return camera if model.ncam or isinstance(camera, str) else -1
 
 
 def _draw_line(scene: mujoco.MjvScene, points: Array, width: float = 3.0) -> None:
@@ -122,10 +270,45 @@ def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
 
 
 def _prefer_offscreen_platform() -> None:
-    """Let MuJoCo render through EGL where there is no display and nothing else was asked for.
+    """Let MuJoCo render through EGL where no display answers and nothing else was asked for.
 
     MuJoCo chooses at its import, often before anyone could tell it (TorchRL imports it), so it has to choose again.
     """
-    if sys.platform == "linux" and not os.environ.get("DISPLAY") and not os.environ.get("MUJOCO_GL"):
+    if sys.platform == "linux" and not os.environ.get("MUJOCO_GL") and not display_answers():
         os.environ["MUJOCO_GL"] = "egl"
         importlib.reload(gl_context)
+
+
+def display_answers(seconds: float = 2.0) -> bool:
+    """Whether somebody serves the display that ``DISPLAY`` names: often nobody does, over ssh, in tmux, under cron."""
+    host, _, number = os.environ.get("DISPLAY", "").rpartition(":")
+    screen = number.partition(".")[0]
+    if not screen.isdecimal():
+        return False
+    if host in ("", "unix"):
+        # Abstract first, as X clients do.
+        return any(
+            _connects(socket.AF_UNIX, f"{root}/tmp/.X11-unix/X{screen}", seconds) for root in ("\0", "")
+        )
+    return any(
+        _connects(family, address[:2], seconds)
+        for family, _, _, _, address in _addresses(host, 6000 + int(screen))
+        if family in (socket.AF_INET, socket.AF_INET6)
+    )
+
+
+def _addresses(host: str, port: int) -> list[Any]:
+    try:
+        return socket.getaddrinfo(host.partition("/")[0], port, type=socket.SOCK_STREAM)
+    except OSError:
+        return []
+
+
+def _connects(family: int, address: Any, seconds: float) -> bool:
+    with socket.socket(family, socket.SOCK_STREAM) as client:
+        client.settimeout(seconds)
+        try:
+            client.connect(address)
+        except OSError:
+            return False
+    return True

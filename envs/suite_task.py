@@ -43,7 +43,7 @@ class SuiteTask(BatchedTask):
         control_timestep: float,
         num_envs: int,
         num_threads: int,
-        seed: int,
+        seed: int | None,
         max_episode_steps: int,
     ) -> None:
         text = xml if isinstance(xml, str) else xml.decode()

@@ -47,7 +47,7 @@ class WAMTask(BatchedTask):
         *,
         num_envs: int,
         num_threads: int,
-        seed: int,
+        seed: int | None,
         success_radius: float,
         tilt_tolerance: float,
         terminate_on_failure: bool,

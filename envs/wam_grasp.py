@@ -66,7 +66,7 @@ class WAMGrasp(WAMTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         *,
         start_noise: float = 0.2,
         tilt_tolerance: float = math.pi / 16,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.registry import Arm
+from nht.envs.arm import Arm
 
 Array = NDArray[np.float64]
 

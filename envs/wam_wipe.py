@@ -60,7 +60,7 @@ class WAMWipe(WAMTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         *,
         start: Start = "fixed",
         swivel_range: float = 0.5,

@@ -10,13 +10,14 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from nht.actuation_lipschitz import actuation_certificate
     from nht.alignment import Aligned, align
     from nht.demos import Demos, load_demos, save_demos
     from nht.export import export_map
     from nht.hdf5 import from_hdf5
     from nht.jacobian import JacobianPinv
     from nht.laser import CAE, LASER
-    from nht.lipschitz import certificate
+    from nht.lipschitz import certificate, offset_certificate
     from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
     from nht.minari import from_minari, to_minari
     from nht.residual import Residual
@@ -25,13 +26,14 @@ if TYPE_CHECKING:
     from nht.train import MapTraining, projection_error, train_map
 
 _NAMES = {
+    "actuation_lipschitz": ("actuation_certificate",),
     "alignment": ("Aligned", "align"),
     "demos": ("Demos", "load_demos", "save_demos"),
     "export": ("export_map",),
     "hdf5": ("from_hdf5",),
     "jacobian": ("JacobianPinv",),
     "laser": ("CAE", "LASER"),
-    "lipschitz": ("certificate",),
+    "lipschitz": ("certificate", "offset_certificate"),
     "maps": ("NHT", "SVD", "ActionMap", "Identity", "LinearActionMap"),
     "minari": ("from_minari", "to_minari"),
     "residual": ("Residual",),
@@ -55,6 +57,7 @@ __all__ = [
     "LinearActionMap",
     "MapTraining",
     "Residual",
+    "actuation_certificate",
     "align",
     "certificate",
     "export_map",
@@ -62,6 +65,7 @@ __all__ = [
     "from_minari",
     "load_demos",
     "load_map",
+    "offset_certificate",
     "projection_error",
     "save_demos",
     "save_map",

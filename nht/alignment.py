@@ -15,11 +15,11 @@ ORTHOGONAL = 1e-5  # the largest entry of R^T R - I that still counts as roundin
 
 
 class Aligned(LinearActionMap):
-    """Another map with its axes turned or mirrored: u = Q(c) R a, with one orthogonal R for all contexts.
+    """Another map with its axes turned or mirrored: u = u0(c) + Q(c) R a, with one orthogonal R for all contexts.
 
-    What the map spans, its projection error, its orthonormal columns, its certificate: none of them changes, for R
-    changes no length. `action_scale` is taken over, too; as a largest entry, that of the turned actions may be up to
-    sqrt(k) times larger or smaller.
+    What the map spans, its offset, its projection error, its orthonormal columns, its certificate: none of them
+    changes, for R changes no length. `action_scale` is taken over, too; as a largest entry, that of the turned actions
+    may be up to sqrt(k) times larger or smaller.
 
     There is nothing to learn: wrap a trained map, or let `align` do so. Its context keys, bounds and fingerprint are
     taken over.
@@ -51,12 +51,20 @@ class Aligned(LinearActionMap):
         return self.map.basis(context) @ self.rotation
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Q(c) R a."""
+        """u0(c) + Q(c) R a."""
         return self.map(action @ self.rotation.mT, context)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
         """The action of the map inside, turned back."""
         return self.map.project(actuation, context) @ self.rotation
+
+    def basis_norm(self) -> float:
+        """That of the map inside: R changes no length."""
+        return self.map.basis_norm()
+
+    def rest(self, context: Tensor) -> Tensor:
+        """That of the map inside."""
+        return self.map.rest(context)
 
     def fit(self, batch: TensorDictBase) -> bool:
         """Refuses, for a basis that learns would turn again.

@@ -37,8 +37,10 @@ def whole_episodes(
 
     Raises:
         KeyError: on a key that is not in the data; the message lists those that are.
-        ValueError: if nothing says where episodes end, or none does.
+        ValueError: if nothing says where episodes end, or none does; if the actuation also stands under "next", as
+            what `ActionMapTransform` executed: then it is, at the root, that of the step before.
     """
+    _check_not_late(data, actuation_key)
     if data.batch_dims == 0:
         raise ValueError("transitions need a batch size (T,) or (N, T), got ()")
     data = data.cpu()
@@ -69,6 +71,15 @@ def whole_episodes(
     if done is not None:
         laid_out["done"] = done[:, None]
     return _numbered(laid_out, first, None if number is None else number.reshape(-1))
+
+
+def _check_not_late(data: TensorDictBase, actuation_key: NestedKey) -> None:
+    following = ("next", *_parts(actuation_key))
+    if isinstance(data.get(following, None), Tensor):
+        raise ValueError(
+            f"key {actuation_key!r} also stands under 'next': at the root it is what the step before executed. "
+            f"The actuation of the same step is actuation_key={following!r}."
+        )
 
 
 def _numbered(data: TensorDict, first: Tensor, number: Tensor | None) -> tuple[TensorDict, int]:

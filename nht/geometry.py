@@ -36,6 +36,14 @@ def sphere_exp(tangent: Tensor) -> Tensor:
     return torch.cat([cosine, tangent * (length.sin() / length)], dim=-1)
 
 
+def sphere_log(point: Tensor) -> Tensor:
+    """The tangent that `sphere_exp` turns into a unit vector: (*batch, n) -> (*batch, n - 1); 0 for -e_1, too."""
+    height, side = point[..., :1], point[..., 1:]
+    length = torch.linalg.vector_norm(side, dim=-1, keepdim=True)
+    angle = torch.atan2(length, height)
+    return side * torch.where(length > 0, angle / length.clamp_min(torch.finfo(point.dtype).tiny), 1)
+
+
 def reflect(reflectors: Tensor, vector: Tensor) -> Tensor:
     """Applies H(v_1) ... H(v_k), where H(v) = I - 2 v v^T (Eq. 8, 9).
 
@@ -102,6 +110,39 @@ def householder_frame(reflectors: Tensor) -> Tensor:
     return reflect(reflectors.unsqueeze(-3), columns).mT
 
 
+def spanning_reflectors(frame: Tensor) -> Tensor:
+    """Unit vectors v_1 ... v_k whose basis (Eq. 7) has the columns of a given frame, but for their signs.
+
+    H(v) with v along x - y takes a unit vector x to y. So v_1 takes e_1 to the first column; v_2, which is orthogonal
+    to e_1 and so leaves it alone, takes e_2 to what v_1 makes of the second column; and so on.
+
+    Args:
+        frame: (n, k), orthonormal columns.
+
+    Returns:
+        (k, n). Their first entries are not negative: `sphere_exp` reaches them within half a turn.
+    """
+    columns = frame.clone()
+    reflectors = []
+    for index in range(frame.shape[-1]):
+        column = columns[:, index]
+        sign = 1.0 if column[index] >= 0 else -1.0  # away from cancellation
+        reflector = sign * column
+        reflector[index] += 1
+        reflector = reflector / torch.linalg.vector_norm(reflector)
+        columns = columns - 2 * torch.outer(reflector, reflector @ columns)
+        reflectors.append(reflector)
+    return torch.stack(reflectors)
+
+
+def principal_directions(actuation: Tensor, count: int) -> Tensor:
+    """The leading right singular vectors, each with its largest entry positive: (T, n) -> (n, count), in float64."""
+    few = len(actuation) < actuation.shape[-1]
+    rows = torch.linalg.svd(actuation.double(), full_matrices=few).Vh[:count]
+    largest = rows.gather(1, rows.abs().argmax(1, keepdim=True))
+    return (rows * largest.sign()).mT
+
+
 def least_squares(basis: Tensor, actuation: Tensor) -> Tensor:
     """The action whose actuation is nearest (Eq. 5), for any basis: (*batch, n, k), (*batch, n) -> (*batch, k).
 
@@ -109,6 +150,8 @@ def least_squares(basis: Tensor, actuation: Tensor) -> Tensor:
     independent, and finite, in value and gradient, where they are not. What a rank-deficient basis leaves
     open gets about the smallest action.
     """
+    if basis.dtype in (torch.float16, torch.bfloat16):  # for which torch solves no equations
+        return least_squares(basis.float(), actuation.float()).to(basis.dtype)
     rounding = torch.finfo(basis.dtype).eps
     # Of unit size, lest squaring overflow. A basis below rounding counts as none.
     size = basis.detach().abs().amax((-2, -1), keepdim=True).clamp_min(rounding)

@@ -91,6 +91,10 @@ class JacobianPinv(LinearActionMap):
         jacobian = self.jacobian(context)
         return torch.linalg.solve_ex(self._damped_gram(jacobian), jacobian).result.mT
 
+    def basis_norm(self) -> float:
+        """1 / (2 damping)."""
+        return 1 / (2 * self.damping)
+
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
         """J(q)^+ a: the least joint velocity that moves the tool as asked."""
         jacobian = self.jacobian(context)

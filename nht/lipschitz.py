@@ -1,11 +1,16 @@
-"""Lipschitz constants of linear action maps: a limit kept in training, and a certificate afterwards.
+"""Lipschitz constants of linear and affine action maps: a limit kept in training, and a certificate afterwards.
 
 A layer s(W x + b) has the constant m |W|, with |W| the spectral norm of its matrix and m the largest slope of
 the activation. The constants of a composition multiply. From the network's output to the basis the map's
 `network_gain` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3), 1 for SCL. The normaliser, which divides
 the context by its deviations, is counted with the first layer, so that every statement is about the raw
 context. Heads side by side have the constant of the largest.
+
+What this says of actuations, and of what `decode` makes of them at the motors' limits, is in
+`nht.actuation_lipschitz`.
 """
+
+from __future__ import annotations
 
 import math
 
@@ -16,6 +21,7 @@ from torch.nn import functional
 from nht.alignment import Aligned
 from nht.maps import ActionMap, LinearActionMap
 from nht.networks import ACTIVATION_SLOPES, ContextNetwork
+from nht.offset import LinearOffset, NetworkOffset
 from nht.residual import Residual
 
 ROUNDING = 1e-6  # a limit is undercut by this share, lest rounding a scaled matrix to float32 exceed it
@@ -39,17 +45,31 @@ def certificate(map: ActionMap) -> float:
         return math.inf
     if map.network is None:
         return map.network_gain
-    norms = [torch.linalg.matrix_norm(matrix.double(), ord=2).max() for matrix in _matrices(map.network)]
-    return map.network_gain * math.prod(_slopes(map.network)) * math.prod(float(norm) for norm in norms)
+    return map.network_gain * _constant(map.network)
+
+
+@torch.no_grad()
+def offset_certificate(map: ActionMap) -> float:
+    """A proven Lipschitz constant of the offset: |u0(c) - u0(c')| <= offset_certificate |c - c'| for all raw contexts.
+
+    Returns:
+        0 for a map without an offset, or with a constant one; infinity where none is known.
+    """
+    if isinstance(map, Aligned | Residual):
+        return offset_certificate(map.map)
+    if not isinstance(map, LinearActionMap):
+        return math.inf
+    model = map.offset_model
+    if isinstance(model, LinearOffset):
+        return float(torch.linalg.matrix_norm(model.slope.double(), ord=2))
+    return _constant(model.network) if isinstance(model, NetworkOffset) else 0.0
 
 
 class LipschitzProjection:
     """Keeps a map within its `lipschitz` limit by scaling down its layers (Gouk et al., 2018).
 
-    Each layer may have the constant (lipschitz / network_gain)^(1 / layers), so that the whole has
-    `lipschitz`. The exact spectral norm is too dear for every step: `step` follows it by power iteration, one
-    round a step from where the last one ended, which can be a little low; `exact` leaves no doubt, and is
-    called before weights are kept. The Frobenius norm, never smaller than the spectral one, is exact in both.
+    The limit is that of Q(c), and that of u0(c) where a network gives it: u0 counts like a column more, of an action
+    that is always 1. Actuations of actions up to M then have the constant lipschitz (M + 1).
 
     Raises:
         ValueError: if the map has no network or no limit.
@@ -60,10 +80,43 @@ class LipschitzProjection:
             raise ValueError(
                 f"{type(map).__name__} has no network to limit, or no limit: lipschitz={map.lipschitz}"
             )
-        self.network = map.network
-        self.frobenius = map.lipschitz_norm == "frobenius"
-        slopes = _slopes(self.network)
-        per_layer = (map.lipschitz / map.network_gain) ** (1 / len(slopes)) * (1 - ROUNDING)
+        frobenius = map.lipschitz_norm == "frobenius"
+        self.networks = [
+            NetworkProjection(map.network, map.lipschitz / map.network_gain, frobenius=frobenius)
+        ]
+        if isinstance(map.offset_model, NetworkOffset):
+            self.networks.append(
+                NetworkProjection(map.offset_model.network, map.lipschitz, frobenius=frobenius)
+            )
+
+    def step(self) -> None:
+        """After an optimiser step."""
+        for network in self.networks:
+            network.step()
+
+    def exact(self) -> None:
+        """Before weights are kept: afterwards `certificate` and `offset_certificate` are at most the limit."""
+        for network in self.networks:
+            network.exact()
+
+
+class NetworkProjection:
+    """Keeps a network within a Lipschitz constant.
+
+    Each layer may have the constant limit^(1 / layers). The exact spectral norm is too dear for every step: `step`
+    follows it by power iteration, one round a step from where the last one ended, which can be a little low; `exact`
+    leaves no doubt. The Frobenius norm, never smaller than the spectral one, is exact in both.
+
+    Args:
+        network: whose layers are scaled.
+        limit: of the network, from raw contexts to its output.
+        frobenius: whether that norm of the matrices is limited, rather than the spectral one.
+    """
+
+    def __init__(self, network: ContextNetwork, limit: float, *, frobenius: bool) -> None:
+        self.network, self.frobenius = network, frobenius
+        slopes = _slopes(network)
+        per_layer = limit ** (1 / len(slopes)) * (1 - ROUNDING)
         self.limits = [per_layer / slope for slope in slopes]
         self.directions: list[
             Tensor
@@ -77,13 +130,18 @@ class LipschitzProjection:
             if self.frobenius:
                 norm = torch.linalg.matrix_norm(matrix, keepdim=True)
             else:
-                self.directions[i] = functional.normalize(matrix.mT @ (matrix @ self.directions[i]), dim=-2)
+                image = matrix.mT @ (matrix @ self.directions[i])
+                # A matrix of zeros, as the last one is at the start, has no direction to follow yet.
+                moved = torch.linalg.vector_norm(image, dim=-2, keepdim=True) > 0
+                self.directions[i] = torch.where(
+                    moved, functional.normalize(image, dim=-2), self.directions[i]
+                )
                 norm = torch.linalg.vector_norm(matrix @ self.directions[i], dim=-2, keepdim=True)
             self._scale(i, norm)
 
     @torch.no_grad()
     def exact(self) -> None:
-        """Before weights are kept: afterwards `certificate(map) <= map.lipschitz`."""
+        """Before weights are kept."""
         self.directions = []
         for i, matrix in enumerate(_matrices(self.network)):
             _, singular, right = torch.linalg.svd(matrix.double(), full_matrices=False)
@@ -93,6 +151,12 @@ class LipschitzProjection:
 
     def _scale(self, index: int, norm: Tensor) -> None:
         self.network.linear(index).weight.mul_((self.limits[index] / norm).clamp_max(1))
+
+
+def _constant(network: ContextNetwork) -> float:
+    """A Lipschitz constant from raw contexts to the output: the product of those of layers and activations."""
+    norms = [torch.linalg.matrix_norm(matrix.double(), ord=2).max() for matrix in _matrices(network)]
+    return math.prod(_slopes(network)) * math.prod(float(norm) for norm in norms)
 
 
 def _matrices(network: ContextNetwork) -> list[Tensor]:

@@ -1,150 +1,29 @@
-"""Action maps: from a low-dimensional action and a context to the actuation of the motors, and back."""
+"""The family's core: NHT, SVD and the raw interface."""
 
-import inspect
-from abc import ABC, abstractmethod
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from torch import Tensor, nn
+from tensordict import TensorDictBase
+from torch import Tensor
 
+from nht.action_map import ActionMap
 from nht.geometry import (
     householder_apply,
     householder_coordinates,
     householder_frame,
-    least_squares,
+    principal_directions,
+    spanning_reflectors,
     sphere_exp,
+    sphere_log,
 )
+from nht.linear_map import LinearActionMap, NormKind
 from nht.networks import Activation, ContextNetwork, check_choice
+from nht.offset import ConstantOffset, LinearOffset, NetworkOffset, OffsetKind, check_offset, trained_offset
 
-NormKind = Literal["spectral", "frobenius"]
-
-
-class ActionMap(nn.Module, ABC):
-    """A fixed or learned map (action, context) -> actuation.
-
-    Shapes: action (*batch, k), actuation (*batch, n), context (*batch, context_dim). A map that needs no
-    context takes one all the same; its last dimension may then be 0. A subclass that keeps its constructor's
-    arguments as attributes of the same names is trained, saved and loaded like those below.
-
-    Attributes:
-        action_dim: k.
-        actuation_dim: n.
-        context_dim: width of the context.
-        context_keys: the entries that, side by side in this order, are the context. None until trained.
-        data_fingerprint: which demonstrations it was trained on. None until trained.
-        action_scale: buffer, scalar: the largest |a_i| of the projected demonstrations. 1 until trained.
-        actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
-        actuation_high: buffer, (n,): the largest ones. infinity until trained.
-        learns: whether demonstrations decide what the map does, not only its bounds.
-        needs_next_context: whether `loss` reads ("next", "context"), (batch, context_dim).
-    """
-
-    learns = True
-    needs_next_context = False
-
-    action_scale: Tensor
-    actuation_low: Tensor
-    actuation_high: Tensor
-
-    def __init__(self, context_dim: int, actuation_dim: int, action_dim: int) -> None:
-        super().__init__()
-        if not 1 <= action_dim <= actuation_dim:
-            raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}")
-        if context_dim < 0:
-            raise ValueError(f"context_dim must be 0 or more, got {context_dim}")
-        self.context_dim = context_dim
-        self.actuation_dim = actuation_dim
-        self.action_dim = action_dim
-        self.context_keys: tuple[NestedKey, ...] | None = None
-        self.data_fingerprint: str | None = None
-        self.register_buffer("action_scale", torch.ones(()))
-        self.register_buffer("actuation_low", torch.full((actuation_dim,), -torch.inf))
-        self.register_buffer("actuation_high", torch.full((actuation_dim,), torch.inf))
-
-    @abstractmethod
-    def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Actuation, (*batch, n). Nothing is scaled or clipped here."""
-
-    @abstractmethod
-    def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """The action, (*batch, k), that stands for an actuation."""
-
-    def loss(self, batch: TensorDictBase) -> Tensor:
-        """What training minimises: the mean of |u - u_hat|^2, u_hat being u projected and mapped back.
-
-        Args:
-            batch: "context" (batch, context_dim) and "actuation" (batch, n); and ("next", "context") for a map
-                that needs it.
-        """
-        actuation, context = batch["actuation"], batch["context"]
-        return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
-
-    def fit(self, batch: TensorDictBase) -> bool:
-        """Prepares the map from all training data, before any gradient step.
-
-        Returns:
-            True if that was all the training it takes: a closed form.
-        """
-        return False
-
-    def init_args(self) -> dict[str, Any]:
-        """The constructor's arguments, JSON values or other maps: they make an untrained twin."""
-        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
-
-    @torch.no_grad()
-    def take_over(self, map: "ActionMap") -> None:
-        """What another map learned about its demonstrations, and its precision and device: for maps that wrap it."""
-        self.context_keys = map.context_keys
-        self.data_fingerprint = map.data_fingerprint
-        self.to(map.action_scale)
-        self.action_scale.copy_(map.action_scale)
-        self.actuation_low.copy_(map.actuation_low)
-        self.actuation_high.copy_(map.actuation_high)
-
-
-class LinearActionMap(ActionMap):
-    """An action map that is linear in the action: u = Q(c) a.
-
-    Attributes:
-        network: what turns the context into a description of the basis; None if the basis is always the same.
-        network_gain: a Lipschitz constant, in the spectral norm, from the network's output to the basis; without
-            a network, from the context to the basis.
-        lipschitz: the Lipschitz constant of Q(c) that training keeps to; None for no limit.
-        lipschitz_norm: the norm of the layers' matrices that is limited to this end.
-    """
-
-    network: ContextNetwork | None
-
-    def __init__(
-        self,
-        context_dim: int,
-        actuation_dim: int,
-        action_dim: int,
-        lipschitz: float | None = None,
-        lipschitz_norm: NormKind = "spectral",
-    ) -> None:
-        super().__init__(context_dim, actuation_dim, action_dim)
-        if lipschitz is not None and not 0 < lipschitz < torch.inf:
-            raise ValueError(f"lipschitz must be a positive number or None, got {lipschitz}")
-        check_choice("lipschitz_norm", lipschitz_norm, get_args(NormKind))
-        self.network = None
-        self.network_gain = 0.0
-        self.lipschitz = lipschitz
-        self.lipschitz_norm = lipschitz_norm
-
-    @abstractmethod
-    def basis(self, context: Tensor) -> Tensor:
-        """Q(c): (*batch, context_dim) -> (*batch, n, k)."""
-
-    def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Q(c) a."""
-        return (self.basis(context) @ action.unsqueeze(-1)).squeeze(-1)
-
-    def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """Least squares: the action whose actuation is nearest (Eq. 5)."""
-        return least_squares(self.basis(context), actuation)
+__all__ = ["NHT", "SVD", "ActionMap", "Identity", "LinearActionMap", "NormKind"]
 
 
 class NHT(LinearActionMap):
@@ -152,6 +31,8 @@ class NHT(LinearActionMap):
 
     A network gives k tangent vectors, the exponential map makes them unit vectors, and the reflections at
     these, applied to the padded action, give Q(c) a.
+
+    With an offset the map is affine, u0(c) + Q(c) a, for robots that do not rest at zero.
 
     Args:
         context_dim: width of the context.
@@ -165,6 +46,10 @@ class NHT(LinearActionMap):
         lipschitz_norm: "spectral", or the stricter "frobenius", which the authors' code limits.
         multi_head: let each reflection have a last hidden layer of its own, of the same width, and its own output
             layer; the layers before are shared. Needs a hidden layer.
+        offset: "none" for u0 = 0; "constant", trained from the mean of the demonstrations on; "contextual", from a
+            network of its own, of the same widths, which keeps to `lipschitz` too.
+        start: where training starts: "svd", from the plane that SVD finds in the training data, the same for all
+            contexts; or "random". With the former a strict limit leaves SVD's plane, not any plane.
         seed: of the initial weights.
 
     Raises:
@@ -185,15 +70,20 @@ class NHT(LinearActionMap):
         lipschitz: float | None = None,
         lipschitz_norm: NormKind = "spectral",
         multi_head: bool = False,
+        offset: OffsetKind = "none",
+        start: Literal["svd", "random"] = "svd",
         seed: int = 0,
     ) -> None:
         super().__init__(context_dim, actuation_dim, action_dim, lipschitz, lipschitz_norm)
         if actuation_dim < 2:
             raise ValueError(f"NHT needs an actuation_dim of at least 2, got {actuation_dim}")
+        check_choice("start", start, ("svd", "random"))
         self.hidden = tuple(hidden)
         self.activation = activation
         self.normalise = normalise
         self.multi_head = multi_head
+        self.offset = offset
+        self.start = start
         self.seed = seed
         tangents, heads = action_dim * (actuation_dim - 1), action_dim if multi_head else 1
         self.network = ContextNetwork(context_dim, tangents, hidden, activation, seed, heads=heads)
@@ -202,6 +92,7 @@ class NHT(LinearActionMap):
         # such fits ended at 100 times the error of the others.
         self.network.start_from_one_output((actuation_dim - 1) ** -0.5, seed)
         self.network_gain = 2 * action_dim**0.5  # Theorem 1; the exponential map has the constant 1
+        self.offset_model = trained_offset(offset, context_dim, actuation_dim, hidden, activation, seed)
 
     def reflectors(self, context: Tensor) -> Tensor:
         """The unit vectors v_1 ... v_k (Eq. 12): (*batch, context_dim) -> (*batch, k, n)."""
@@ -212,56 +103,94 @@ class NHT(LinearActionMap):
         """Q(c), with orthonormal columns. `forward` and `project` do without it."""
         return householder_frame(self.reflectors(context))
 
+    def basis_norm(self) -> float:
+        """1: the columns are orthonormal."""
+        return 1.0
+
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Q(c) a, by k reflections of the padded action."""
-        return householder_apply(self.reflectors(context), action)
+        """u0(c) + Q(c) a, by k reflections of the padded action."""
+        return self.from_rest(householder_apply(self.reflectors(context), action), context)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """Q(c)^T u, which is least squares for orthonormal columns."""
-        return householder_coordinates(self.reflectors(context), actuation)[..., : self.action_dim]
+        """Q(c)^T (u - u0(c)), which is least squares for orthonormal columns."""
+        way = self.to_rest(actuation, context)
+        return householder_coordinates(self.reflectors(context), way)[..., : self.action_dim]
 
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """The mean of |u - Q Q^T u|^2 (Eq. 6), read off the last n - k coordinates of u."""
-        coordinates = householder_coordinates(self.reflectors(batch["context"]), batch["actuation"])
-        return coordinates[..., self.action_dim :].square().sum(-1).mean()
+        """The mean of |u - Q Q^T u|^2 (Eq. 6), u measured from u0(c), read off the last n - k coordinates of u."""
+        way = self.to_rest(batch["actuation"], batch["context"])
+        coordinates = householder_coordinates(self.reflectors(batch["context"]), way)
+        return coordinates[..., self.action_dim :].square().sum(-1).mean() + self.offset_loss(way)
 
+    @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normaliser; the weights are left to gradient steps."""
+        """Sets the normaliser and where to start; the rest is left to gradient steps."""
+        context, actuation = batch["context"], batch["actuation"]
         if self.normalise:
-            self.network.normalise(batch["context"])
+            self.network.normalise(context)
+        if isinstance(self.offset_model, ConstantOffset | NetworkOffset):
+            self.offset_model.fit(context, actuation, normalise=self.normalise)
+        if self.start == "svd":
+            frame = principal_directions(self.to_rest(actuation, context), self.action_dim)
+            self.network.start_from(sphere_log(spanning_reflectors(frame)))
         return False
 
 
 class SVD(LinearActionMap):
     """One basis for all contexts: the k leading right singular vectors of the demonstrated actuations.
 
-    They are not centred before, because a = 0 must stay u = 0. Until trained, the basis is the first k axes.
+    Without an offset they are not centred before, because a = 0 must stay u = 0. Until trained, the basis is the first
+    k axes.
+
+    Args:
+        actuation_dim: n.
+        action_dim: k, in 1 ... n.
+        context_dim: width of the context.
+        offset: "none" for u0 = 0; "constant" for the mean actuation; "contextual" for u0(c) = A c + b. Least squares
+            for u0, then the singular vectors of what it leaves: no other pair of the two has a smaller error, for
+            whatever the basis is, this u0 leaves least outside its span. An offset that is not linear takes gradient
+            steps: NHT has it.
     """
 
     frame: Tensor
 
-    def __init__(self, actuation_dim: int, action_dim: int, context_dim: int = 0) -> None:
+    def __init__(
+        self, actuation_dim: int, action_dim: int, context_dim: int = 0, offset: OffsetKind = "none"
+    ) -> None:
         super().__init__(context_dim, actuation_dim, action_dim)
+        check_offset(offset, context_dim)
+        self.offset = offset
         self.register_buffer("frame", torch.eye(actuation_dim, action_dim))
+        if offset == "constant":
+            self.offset_model = ConstantOffset(actuation_dim)
+        elif offset == "contextual":
+            self.offset_model = LinearOffset(context_dim, actuation_dim)
 
     def basis(self, context: Tensor) -> Tensor:
         """The same for every context."""
         return self.frame.expand(*context.shape[:-1], -1, -1)
 
+    @torch.no_grad()
+    def basis_norm(self) -> float:
+        """That of the one basis."""
+        return float(torch.linalg.matrix_norm(self.frame.double(), ord=2))
+
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
-        """Q a."""
-        return action @ self.frame.mT
+        """u0(c) + Q a."""
+        return self.from_rest(action @ self.frame.mT, context)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """Q^T u, which is least squares for orthonormal columns."""
-        return actuation @ self.frame
+        """Q^T (u - u0(c)), which is least squares for orthonormal columns."""
+        return self.to_rest(actuation, context) @ self.frame
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        """The singular vectors, each with its largest entry positive, as their signs are arbitrary."""
-        rows = torch.linalg.svd(batch["actuation"].double(), full_matrices=False).Vh[: self.action_dim]
-        largest = rows.gather(1, rows.abs().argmax(1, keepdim=True))
-        self.frame.copy_((rows * largest.sign()).mT)
+        """The offset, then the singular vectors, each with its largest entry positive, as their signs are arbitrary."""
+        way = batch["actuation"]
+        if isinstance(self.offset_model, ConstantOffset | LinearOffset):
+            self.offset_model.fit(batch["context"], way)
+            way = self.to_rest(way, batch["context"])
+        self.frame.copy_(principal_directions(way, self.action_dim))
         return True
 
 
@@ -277,6 +206,10 @@ class Identity(LinearActionMap):
         """The identity matrix."""
         identity = torch.eye(self.actuation_dim, dtype=context.dtype, device=context.device)
         return identity.expand(*context.shape[:-1], -1, -1)
+
+    def basis_norm(self) -> float:
+        """1: that of the identity matrix."""
+        return 1.0
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:
         """The action itself."""

@@ -67,7 +67,7 @@ class ContextNetwork(nn.Module):
         check_choice("activation", activation, get_args(Activation))
         if context_dim < 1 or any(width < 1 for width in hidden):
             raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}")
-        if heads > 1 and not hidden:
+        if heads > 1 and not len(hidden):
             raise ValueError(
                 "several heads need a hidden layer that they can have of their own, got hidden=[]"
             )
@@ -75,7 +75,7 @@ class ContextNetwork(nn.Module):
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
             widths = [context_dim + other_dim, *hidden]
-            widths[-1] *= heads if hidden else 1
+            widths[-1] *= heads if len(hidden) else 1
             self.layers = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
             if heads > 1:
                 self.layers.append(Heads(heads, hidden[-1], output_dim // heads))
@@ -117,6 +117,13 @@ class ContextNetwork(nn.Module):
         head = self.linear(-1)
         head.weight.mul_(0.1)
         head.bias.normal_(std=size, generator=torch.Generator().manual_seed(seed))
+
+    @torch.no_grad()
+    def start_from(self, output: Tensor) -> None:
+        """Gives all contexts this very output, (output_dim,), until gradient steps tell them apart."""
+        head = self.linear(-1)
+        head.weight.zero_()
+        head.bias.copy_(output.view_as(head.bias))
 
 
 def check_choice(name: str, given: str, allowed: Sequence[str]) -> None:

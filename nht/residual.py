@@ -56,6 +56,10 @@ class Residual(ActionMap):
         missed = actuation - self.map(interface, context)
         return torch.cat([interface, missed / self.scale], dim=-1)
 
+    def rest(self, context: Tensor) -> Tensor:
+        """That of the map inside."""
+        return self.map.rest(context)
+
     def fit(self, batch: TensorDictBase) -> bool:
         """Refuses, for with corrections every actuation is reached, whatever the map.
 

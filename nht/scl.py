@@ -5,8 +5,10 @@ from collections.abc import Sequence
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from nht.geometry import least_squares
 from nht.maps import LinearActionMap, NormKind
 from nht.networks import Activation, ContextNetwork
+from nht.offset import ConstantOffset, NetworkOffset, OffsetKind, trained_offset
 
 
 class SCL(LinearActionMap):
@@ -29,6 +31,8 @@ class SCL(LinearActionMap):
         lipschitz: Lipschitz constant of Q(c) that training keeps to, in the spectral norm and the raw
             context.
         lipschitz_norm: the norm of the layers' matrices that is limited to this end, "spectral" or "frobenius".
+        offset: "none" for u0 = 0; "constant", trained from the mean of the demonstrations on; "contextual", from a
+            network of its own, of the same widths, which keeps to `lipschitz` too. Then u = u0(c) + Q(c) a.
         seed: of the initial weights.
 
     Raises:
@@ -48,33 +52,40 @@ class SCL(LinearActionMap):
         normalise: bool = False,
         lipschitz: float | None = None,
         lipschitz_norm: NormKind = "spectral",
+        offset: OffsetKind = "none",
         seed: int = 0,
     ) -> None:
         super().__init__(context_dim, actuation_dim, action_dim, lipschitz, lipschitz_norm)
         self.hidden = tuple(hidden)
         self.activation = activation
         self.normalise = normalise
+        self.offset = offset
         self.seed = seed
         self.network = ContextNetwork(context_dim, actuation_dim * action_dim, hidden, activation, seed)
         self.network.start_from_one_output(actuation_dim**-0.5, seed)  # columns of length about 1
         self.network_gain = 1.0
+        self.offset_model = trained_offset(offset, context_dim, actuation_dim, hidden, activation, seed)
 
     def basis(self, context: Tensor) -> Tensor:
         """Q(c), any n x k matrix."""
         return self.network(context).unflatten(-1, (self.actuation_dim, self.action_dim))
 
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """The mean of |u - Q Q^+ u|^2 (Eq. 6).
+        """The mean of |u - Q Q^+ u|^2 (Eq. 6), u measured from u0(c).
 
         At the least-squares action the loss does not change with the action (envelope theorem). So the action counts
         as a constant in the gradient, and no derivative of an inverse is ever taken.
         """
-        actuation, context = batch["actuation"], batch["context"]
-        action = self.project(actuation, context).detach()
-        return (actuation - self(action, context)).square().sum(-1).mean()
+        context, basis = batch["context"], self.basis(batch["context"])
+        way = self.to_rest(batch["actuation"], context)
+        action = least_squares(basis, way).detach()
+        missed = way - (basis @ action.unsqueeze(-1)).squeeze(-1)
+        return missed.square().sum(-1).mean() + self.offset_loss(way)
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normaliser; the weights are left to gradient steps."""
+        """Sets the normaliser and where u0 starts; the weights are left to gradient steps."""
         if self.normalise:
             self.network.normalise(batch["context"])
+        if isinstance(self.offset_model, ConstantOffset | NetworkOffset):
+            self.offset_model.fit(batch["context"], batch["actuation"], normalise=self.normalise)
         return False

@@ -1,185 +1,275 @@
 """A map in one safetensors file: the weights and, as JSON in the header, what it takes to rebuild the map.
 
-Loading checks every part and never unpickles. The header can be read without this package:
-`json.loads(safetensors.safe_open(path, "pt").metadata()["map"])`.
+Loading checks every part, never unpickles, and imports nothing that the caller has not allowed. The header can be read
+without this package: ``json.loads(safetensors.safe_open(path, "pt").metadata()["map"])``.
 """
 
-import inspect
+from __future__ import annotations
+
+import hashlib
 import json
 import math
-import os
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib.metadata import version
+import stat
+from collections.abc import Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
-from nht.lipschitz import certificate
-from nht.maps import ActionMap
+from nht.action_map import ActionMap
+from nht.description import describe, of_version_1, twin
+from nht.replacing import replacing
+
+__all__ = ["check_storable", "describe", "load_map", "replacing", "save_map"]
 
 FORMAT = "nht.action_map"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+BOUNDS = ("actuation_low", "actuation_high")  # buffers that may be infinite
+FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.eye, torch.rand, torch.randn)
+LONGEST_REASON = 600  # characters of what an error says about a file
 
 
 def save_map(map: ActionMap, path: str | Path) -> Path:
     """Writes a map to one file; a reader sees the old file or the whole new one, never a part.
 
-    Normaliser and bounds are buffers and therefore among the weights. The header has class, constructor
-    arguments and the context's keys in order; and for whoever reads only the header k, n, bounds,
-    certificate, the fingerprint of the data and the version.
+    Normaliser, scale and bounds are buffers and therefore among the weights. The header has the class, by module and
+    name, the constructor's arguments, the context's keys in order and the saturation; for whoever reads only the header
+    k, n, scale, bounds, certificate, the fingerprint of the data and the version; and a checksum over all of it.
 
     Returns:
         The path.
+
+    Raises:
+        TypeError: if an argument of the constructor cannot stand in a file; `train_map` says so before it trains.
+        ValueError: if a weight is not finite.
     """
     path = Path(path)
-    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": json.dumps(describe(map))}
-    tensors = {name: value.detach().cpu().contiguous() for name, value in map.state_dict().items()}
+    tensors = _tensors(map)
+    _check_finite(map, tensors)
+    text = json.dumps(describe(map))
+    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": text}
+    header["checksum"] = _checksum(text, tensors)
+    content = save(tensors, header)
     with replacing(path) as scratch:
-        save_file(tensors, scratch, header)
+        scratch.write_bytes(content)
     return path
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A scratch file of the same name, which takes the place of `path` once it is written whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        scratch = Path(folder) / path.name
-        yield scratch
-        os.replace(scratch, path)
-
-
-def load_map(path: str | Path, device: torch.device | str = "cpu") -> ActionMap:
+def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Sequence[str] = ()) -> ActionMap:
     """Reads a map, ready to use: in eval mode, its parameters without gradients.
 
-    A class of your own is found once its module is imported.
+    A class of your own is found if its module is imported, or is, or lies in, one of those in ``allow``, which are then
+    imported. Files of format version 1 load as they did; they clip actuations.
+
+    Args:
+        path: of a file that `save_map` wrote.
+        device: where the map shall be.
+        allow: modules and packages that may be imported, and so run, for the map's class.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is cut short, no map, of another format version or of an unknown class, or if
-            its weights do not fit the class.
+        PermissionError: if it may not be read.
+        ValueError: if the file is cut short, no map, changed since it was written, of another format version or of a
+            class that is not found; if its weights do not fit the class or are not finite.
     """
     path = Path(path)
+    _check_readable(path)
+    try:
+        return _loaded(path, allow).to(device).eval().requires_grad_(False)
+    except Exception as error:  # whatever stands in a file, the answer names the file
+        known = isinstance(error, ValueError) and not isinstance(error, UnicodeError | json.JSONDecodeError)
+        reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
+        raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}") from error
+
+
+@torch.no_grad()
+def check_storable(map: ActionMap) -> None:
+    """Builds the twin that a file of this map would give, so that what cannot be saved shows before it is trained.
+
+    Raises:
+        TypeError: if an argument of the constructor cannot stand in a file, or the state is not all of tensors.
+        ValueError: if the twin is another map.
+    """
+    name = type(map).__name__
+    tensors = _tensors(map)
+    positional, named = (
+        json.loads(json.dumps(_listed(part))) for part in (map.init_positional(), map.init_args())
+    )
+    try:
+        other = type(map)(*map.init_positional(), **map.init_args())
+        again = json.loads(json.dumps([_listed(other.init_positional()), _listed(other.init_args())]))
+    except Exception as error:
+        raise ValueError(
+            f"{name} could not be loaded after saving: constructed from {_listed(named)}, it raises "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    if again != [positional, named]:
+        raise ValueError(
+            f"{name} could not be loaded after saving: an attribute named like an argument of the constructor must be "
+            f"that argument, but {[positional, named]} turns into {again}."
+        )
+    shapes, expected = (
+        {key: value.shape for key, value in part.items()} for part in (other.state_dict(), tensors)
+    )
+    if shapes != expected:
+        changed = sorted({*shapes.items()} ^ {*expected.items()})
+        raise ValueError(
+            f"{name} could not be loaded after saving: constructed again, its weights differ: {changed}."
+        )
+
+
+def _listed(value: Any) -> Any:
+    """Arguments for comparison: a map among them by its class and arguments."""
+    if isinstance(value, ActionMap):
+        return [type(value).__qualname__, _listed(value.init_positional()), _listed(value.init_args())]
+    if isinstance(value, dict):
+        return {key: _listed(one) for key, one in value.items()}
+    return [_listed(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def _tensors(map: ActionMap) -> dict[str, Tensor]:
+    """The state as it is written: on the CPU, tied weights each on their own."""
+    state = map.state_dict()
+    if strange := [key for key, value in state.items() if not isinstance(value, Tensor)]:
+        raise TypeError(
+            f"the state of {type(map).__name__} has entries that are no tensors: {', '.join(strange)}."
+        )
+    return {key: value.detach().cpu().contiguous().clone() for key, value in state.items()}
+
+
+def _checksum(text: str, tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of the description and, in the order of their names, every tensor's name, type, shape and bytes."""
+    digest = hashlib.sha256(text.encode())
+    for name, value in sorted(tensors.items()):
+        digest.update(f"\n{name} {value.dtype} {list(value.shape)}\n".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _check_readable(path: Path) -> None:
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ValueError(f"{path} is no file that holds a map, but a folder or a device.")
+        path.open("rb").close()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileNotFoundError(f"there is no map file {path}.") from error
+    except PermissionError as error:
+        raise PermissionError(
+            f"the map file {path} may not be read by this user: {error.strerror}."
+        ) from error
+
+
+def _loaded(path: Path, allow: Sequence[str]) -> ActionMap:
     header, tensors = _read(path)
     if header.get("format") != FORMAT:
-        raise ValueError(f"{path} holds no action map: its header is not marked {FORMAT!r}")
+        raise ValueError(f"holds no action map: its header is not marked {FORMAT!r}.")
     found = header.get("format_version")
-    if found != str(FORMAT_VERSION):
-        raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}")
-    try:
-        description = json.loads(header["map"])
-        map = _untrained(description, path)
-        keys = description["context_keys"]
-        map.data_fingerprint = description["data_fingerprint"]
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is an action map, but its description is damaged: {error}") from error
-    map.context_keys = (
-        None if keys is None else tuple(key if isinstance(key, str) else tuple(key) for key in keys)
-    )
-    _fill(map, tensors, path)
-    return map.to(device).eval().requires_grad_(False)
-
-
-def describe(map: ActionMap) -> dict[str, Any]:
-    """What whoever reads only the header learns of a map: JSON values, None where a number is infinite."""
-    return {
-        "class": type(map).__name__,
-        "init_args": _encoded(map),
-        "context_keys": map.context_keys,
-        "data_fingerprint": map.data_fingerprint,
-        "context_dim": map.context_dim,
-        "actuation_dim": map.actuation_dim,
-        "action_dim": map.action_dim,
-        "action_scale": float(map.action_scale),
-        "actuation_low": [_finite(value) for value in map.actuation_low.tolist()],
-        "actuation_high": [_finite(value) for value in map.actuation_high.tolist()],
-        "lipschitz_certificate": _finite(certificate(map)),
-        "nht_version": version("nht"),
-    }
-
-
-def _encoded(map: ActionMap) -> dict[str, Any]:
-    """A map's arguments; a map among them becomes its class and arguments."""
-    return {
-        name: {"class": type(value).__name__, "init_args": _encoded(value)}
-        if isinstance(value, ActionMap)
-        else value
-        for name, value in map.init_args().items()
-    }
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if math.isfinite(value) else None
+    if found not in ("1", str(FORMAT_VERSION)):
+        raise ValueError(f"has format version {found}, this version of nht reads 1 and {FORMAT_VERSION}.")
+    text = header["map"]
+    if found != "1" and header.get("checksum") != _checksum(text, tensors):
+        raise ValueError("has been changed since it was written: its checksum does not fit.")
+    description = json.loads(text)
+    if found == "1":
+        description = of_version_1(description)
+    with _Allowance(sum(value.nbytes for value in tensors.values())):
+        map = twin(description, allow)
+    _fill(map, tensors)
+    _check_description(map, description)
+    _check_finite(map, tensors)
+    return map
 
 
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no map file {path}")
     try:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise ValueError(f"{path} is no safetensors file, or is cut short: {error}") from error
+        raise ValueError(f"is no safetensors file, or is cut short: {error}.") from error
 
 
-def _untrained(description: dict[str, Any], path: Path) -> ActionMap:
-    """The saved map's twin, before training."""
-    name = description["class"]
-    known = {kind.__name__: kind for kind in _subclasses(ActionMap) if not inspect.isabstract(kind)}
-    if name not in known:
-        raise ValueError(
-            f"{path} holds a map of the unknown class {name!r}; known are {', '.join(sorted(known))}. "
-            "Import a class of your own before loading its map"
-        )
-    arguments = {
-        key: _untrained(value, path) if isinstance(value, dict) and "class" in value else value
-        for key, value in dict(description["init_args"]).items()
-    }
-    try:
-        return known[name](**arguments)
-    except TypeError as error:
-        raise ValueError(f"{path} holds arguments that {name} does not take: {error}") from error
+class _Allowance(TorchFunctionMode):
+    """Lets the constructor make no more than the file can fill, for a small file could ask for any amount of memory."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.size, self.left = size, 4 * size + 2**24  # bytes; what is made on the way counts too
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func in FACTORIES:
+            sized = {
+                key: value for key, value in kwargs.items() if key not in ("generator", "out", "pin_memory")
+            }
+            self.left -= func(*args, **sized | {"device": "meta"}).nbytes
+            if self.left < 0:
+                raise ValueError(
+                    f"describes a map far larger than the {self.size} bytes of weights that it holds."
+                )
+        return func(*args, **kwargs)
 
 
-def _subclasses(parent: type) -> Iterator[type]:
-    child: type
-    for child in parent.__subclasses__():
-        yield child
-        yield from _subclasses(child)
-
-
-def _fill(map: ActionMap, tensors: dict[str, Tensor], path: Path) -> None:
+def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
     """Loads the weights, all of them and no others, in the precision they were saved in."""
-    untrained = map.state_dict()
+    name, untrained = type(map).__name__, map.state_dict()
     if untrained.keys() != tensors.keys():
         raise ValueError(
-            f"the weights in {path} do not fit {type(map).__name__}: "
-            f"missing {sorted(untrained.keys() - tensors.keys())}, "
-            f"unexpected {sorted(tensors.keys() - untrained.keys())}"
+            f"holds weights that do not fit {name}: missing {sorted(untrained.keys() - tensors.keys())}, "
+            f"unexpected {sorted(tensors.keys() - untrained.keys())}."
         )
     precision = tensors["action_scale"].dtype
-    for name, value in untrained.items():
-        dtype = precision if value.is_floating_point() else value.dtype
-        if tensors[name].shape != value.shape or tensors[name].dtype != dtype:
+    for key, value in untrained.items():
+        allowed = [value.dtype]
+        if value.is_floating_point():
+            # That of the map; only what was of another one from the start may have kept it.
+            allowed = [precision] if value.dtype == map.action_scale.dtype else [precision, value.dtype]
+        given = tensors[key]
+        if given.shape != value.shape or given.dtype not in allowed:
             raise ValueError(
-                f"the weights in {path} do not fit {type(map).__name__}: {name} is {tensors[name].dtype} "
-                f"{tuple(tensors[name].shape)}, expected {dtype} {tuple(value.shape)}"
+                f"holds weights that do not fit {name}: {key} is {given.dtype} {tuple(given.shape)}, "
+                f"expected {allowed[0]} {tuple(value.shape)}."
             )
-    map.to(precision).load_state_dict(tensors)
+    map.to(precision)
+    for key, value in map.state_dict(keep_vars=True).items():
+        value.data = value.data.to(tensors[key].dtype)
+    map.load_state_dict(tensors)
+
+
+def _check_description(map: ActionMap, description: dict[str, Any]) -> None:
+    """What the header says for people must be what the map does."""
+    for name in ("context_dim", "actuation_dim", "action_dim", "action_scale"):
+        if description[name] != (actual := float(getattr(map, name))):
+            raise ValueError(
+                f"contradicts itself: its description has {name} {description[name]}, its map {actual:g}."
+            )
+
+
+def _check_finite(map: ActionMap, tensors: dict[str, Tensor]) -> None:
+    scale = float(map.action_scale)
+    if not 0 < scale < math.inf:
+        raise ValueError(f"holds a map whose action_scale is {scale}; it must be positive and finite.")
+    for key, value in tensors.items():
+        bound = key.rpartition(".")[2] in BOUNDS
+        if not (~value.isnan() if bound else value.isfinite()).all():
+            raise ValueError(f"holds a map whose {key} is not finite everywhere.")
 
 
 def format_version(path: str | Path) -> int:
-    """The format version of a map file.
+    """The format version of a map file: 1 for those that say neither saturation nor offset.
 
     Raises:
-        FileNotFoundError, ValueError: as `load_map`.
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no map file.
     """
-    header, _ = _read(Path(path))
-    return int(header.get("format_version", "0"))
+    _check_readable(Path(path))
+    try:
+        return int(_read(Path(path))[0].get("format_version", "0"))
+    except ValueError as error:
+        raise ValueError(f"{path} {error}") from error

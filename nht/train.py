@@ -13,6 +13,7 @@ from torch import Tensor
 from nht.demos import Demos
 from nht.lipschitz import LipschitzProjection, certificate
 from nht.maps import ActionMap, LinearActionMap
+from nht.storage import check_storable
 
 EVALUATE_EVERY = 250  # gradient steps
 RANK_TOLERANCE = 1e-5  # actuations' singular values below this share of the largest one are rounding
@@ -71,6 +72,7 @@ def train_map(
             two episodes; on a number out of range. FloatingPointError: if the loss diverged from the start.
     """
     _check_numbers(batch_size, learning_rate, max_steps, patience, validation_share)
+    check_storable(map)
     start = time.perf_counter()
     keys = _context_keys(demos, map, context_keys)
     data = _training_data(demos, map, keys)
@@ -178,11 +180,13 @@ def _keep_best(
 ) -> tuple[int, int]:
     """Trains until the validation error stops falling: the steps made, and the step of the best weights."""
     start = time.perf_counter()
-    best_error, best_step, step = float("inf"), 0, 0
-    best_weights = map.state_dict()
+    # The start counts, too: a map that starts at the best plane never ends below it.
+    best_error, best_step, step = projection_error(map, validation["context"], validation["actuation"]), 0, 0
+    best_weights, diverged = copy.deepcopy(map.state_dict()), True
     for step, loss in rounds:
         if not math.isfinite(loss):
             break
+        diverged = False
         error = projection_error(map, validation["context"], validation["actuation"])
         if error < best_error:
             best_error, best_step, best_weights = error, step, copy.deepcopy(map.state_dict())
@@ -191,7 +195,7 @@ def _keep_best(
             progress({"step": step, "loss": loss, "validation_error": error, "seconds": seconds})
         if step - best_step >= patience:
             break
-    if best_step == 0:
+    if diverged:
         raise FloatingPointError(f"training diverged in the first {step} steps; lower learning_rate")
     map.load_state_dict(best_weights)
     return step, best_step
@@ -225,11 +229,14 @@ def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> T
         raise ValueError(
             f"the map's context has width {map.context_dim}, the keys give {context.shape[-1]}: {widths}"
         )
-    singular = torch.linalg.svdvals(actuation.double())
+    affine = isinstance(map, LinearActionMap) and map.offset_model is not None
+    spread = actuation.double() - actuation.double().mean(0) if affine else actuation.double()
+    singular = torch.linalg.svdvals(spread)
     rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
     if map.learns and rank < map.action_dim < map.actuation_dim:
         raise ValueError(
-            f"the demonstrations have {rank} independent actuations, too few for k = {map.action_dim}"
+            f"the demonstrations have {rank} independent actuations"
+            f"{', measured from their mean' if affine else ''}, too few for k = {map.action_dim}"
         )
     data = TensorDict({"context": context, "actuation": actuation}, batch_size=len(actuation))
     if map.needs_next_context:

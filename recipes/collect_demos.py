@@ -79,7 +79,7 @@ def record_policy(
         raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
     options = trained.env.options | endings(env.name)
     task_config = replace(trained.env, options=options, num_threads=env.num_threads)
-    simulation = mapped_env(task_config, kept_map(folder, trained), seed=seed, num_envs=COPIES)
+    simulation = mapped_env(task_config, kept_map(folder, trained, allow=allow), seed=seed, num_envs=COPIES)
     policy = load_policy(folder, simulation, trained)
     with closing(simulation), set_exploration_type(ExplorationType.DETERMINISTIC):
         data, left_out = record(

@@ -11,6 +11,7 @@ from typing import Any
 from nht.recipes.agents.ddpg import DDPG
 from nht.recipes.agents.ppo import PPO
 from nht.recipes.agents.table import find_algorithm
+from nht.recipes.run.metrics import check_outcome
 from nht.recipes.sections import (
     DemosConfig,
     EnvConfig,
@@ -117,7 +118,7 @@ class SearchConfig:
     best_seeds: int = 5  # fresh ones, on which the best configuration of each interface is run again
     best_frames: int = 1_000_000
     base: list[str] = field(default_factory=list)  # what every run is told, as on the recipe's command line
-    space: dict[str, Any] = field(default_factory=dict)  # see recipes/search_space.py
+    space: dict[str, Any] = field(default_factory=dict)  # see recipes/study/space.py
 
     def __post_init__(self) -> None:
         """Raise ValueError for a search of nothing, or by what runs do not report."""
@@ -126,8 +127,7 @@ class SearchConfig:
                 raise ValueError(f"search.{name} must be at least 1, got {getattr(self, name)}.")
         if self.best_seeds < 0:
             raise ValueError(f"search.best_seeds must not be negative, got {self.best_seeds}.")
-        if self.metric not in ("success", "return"):
-            raise ValueError(f"search.metric must be success or return, got {self.metric!r}.")
+        check_outcome("search.metric", self.metric)
         find_algorithm(self.recipe)
 
 
@@ -152,12 +152,13 @@ class Report:
     out: str = path_field("")  # "" is a folder called report in the first of these
     title: str = ""
     metric: str = "success"  # or return: what the table and the curves show of every evaluation
-    allow: list[str] = field(default_factory=list)  # packages whose code a run's configuration may name
+    lines: str = "interface"  # or algorithm: what is compared in a table and a figure
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a metric that evaluations do not have."""
-        if self.metric not in ("success", "return"):
-            raise ValueError(f"metric must be success or return, got {self.metric!r}.")
+        """Raise ValueError for a metric that evaluations do not have, or for lines of another kind."""
+        check_outcome("metric", self.metric)
+        if self.lines not in ("interface", "algorithm"):
+            raise ValueError(f"lines must be interface or algorithm, got {self.lines!r}.")
 
 
 @dataclass
@@ -168,3 +169,4 @@ class ExportMap:
     out: str = path_field("")  # name.onnx or name.pt2; replaced if it exists
     action_scale: float | None = None  # what an action of 1 is worth; None is what the map says
     compiled: bool = False  # .pt2 only: machine code, for C++
+    allow: list[str] = field(default_factory=list)  # packages whose classes the file may name

@@ -6,12 +6,17 @@ python -m nht.recipes.ddpg env=wam_wipe map=nht seed=0
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from nht.recipes.agents.ddpg import DDPG, PaperDDPGLoss, networks
-from nht.recipes.agents.off_policy import STORED, JointSoftUpdate, exploring
+from nht.recipes.agents.off_policy import (
+    JointSoftUpdate,
+    descend,
+    exploring,
+    minibatches,
+    replay_buffer,
+    storable,
+)
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
@@ -45,9 +50,7 @@ def main(config: DDPG) -> None:
         ],
         fused=True,
     )
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(ranks.share("algo.buffer_size", algo.buffer_size), device=ranks.device),
-    )
+    buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
     batch_size = ranks.share("algo.batch_size", algo.batch_size)
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     explorer = exploring(policy, envs.train, algo)
@@ -57,36 +60,19 @@ def main(config: DDPG) -> None:
         for data in batches:  # (copies, steps)
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
-            data = look_ahead(charge_failure(data, algo.gamma, rewards)).reshape(-1)
-            buffer.extend(data[data["action"].isfinite().all(-1)].select(*STORED))
+            buffer.extend(storable(look_ahead(charge_failure(data, algo.gamma, rewards))))
 
-            if record.frames >= algo.warmup_frames and algo.updates_per_batch:
-                replay = buffer.sample(algo.updates_per_batch * batch_size).to(ranks.device)
-                with torch.no_grad():
-                    features(replay), features(replay["next"])
-                for batch in replay.split(batch_size):
-                    record.count_update(descend(batch, loss, optimiser, ranks))
+            if record.frames >= algo.warmup_frames:
+                for batch in minibatches(buffer, algo.updates_per_batch, batch_size, features, ranks.device):
+                    losses = loss(batch)
+                    descend([losses["loss_actor"], losses["loss_value"]], optimiser, ranks)
+                    record.count_update(losses)
                     if record.counters.updates % algo.target_update_every == 0:
                         target.step()
 
             if record.evaluation_due:
                 record.log(evaluate(envs.test, policy))
     loop.finish(policy)
-
-
-def descend(
-    batch: TensorDictBase,
-    loss: PaperDDPGLoss,
-    optimiser: torch.optim.Optimizer,
-    ranks: Ranks,
-) -> TensorDictBase:
-    """One gradient step of actor and critic, on the batches ``(B,)`` of all ranks as if they were one; the losses."""
-    losses = loss(batch)
-    (losses["loss_actor"] + losses["loss_value"]).backward()
-    ranks.average_gradients(loss.parameters())
-    optimiser.step()
-    optimiser.zero_grad()
-    return losses
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def main(config: Evaluate) -> None:
     trained = read_config(folder, config.allow)
     env = lasting_failures(trained.env)
     env = replace(env, options=env.options | config.env_options)
-    map = kept_map(folder, trained)
+    map = kept_map(folder, trained, allow=config.allow)
 
     def build(copies: int) -> TransformedEnv:
         return mapped_env(env, map, seed=config.seed, num_envs=copies)

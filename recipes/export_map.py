@@ -12,7 +12,7 @@ from nht.recipes.launch import launch
 
 def main(config: ExportMap) -> None:
     """Export, and say what to feed it."""
-    map = nht.load_map(config.file)
+    map = nht.load_map(config.file, allow=config.allow)
     out = nht.export_map(map, config.out, action_scale=config.action_scale, compiled=config.compiled)
     keys = "" if map.context_keys is None else f": {list(map.context_keys)}, side by side"
     print(f"{out}: action (batch, {map.action_dim}), context (batch, {map.context_dim}){keys}")

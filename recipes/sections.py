@@ -67,6 +67,8 @@ class MapConfig:
     hidden: list[int] = field(default_factory=lambda: [256, 256])
     activation: str = "tanh"
     multi_head: bool = False  # nht: each reflection has a last hidden layer of its own
+    offset: str = "none"  # nht, scl, svd: constant or contextual, the actuation of no action
+    start: str = "svd"  # nht: training starts from the plane that SVD finds; or random
     lipschitz: float | None = None  # bound L on the whole map; None leaves it free
     lipschitz_per_layer: bool = False  # L bounds each layer instead, if there is a bound
     learning_rate: float = 1e-3
@@ -75,6 +77,7 @@ class MapConfig:
     beta_kl: float = 1e-3  # laser: weight of the KL divergence of its latents
     beta_dynamics: float = 1e-3  # laser: weight of predicting the next context
     residual: float | None = None  # adds n corrections to the action, each worth this much actuation
+    saturation: str | None = None  # at the motors' limits: scale or clip; None is what the map says
     # What an action of 1 is worth: a number, null for the demonstrations' largest action, or what the kind says.
     action_scale: Any = DEFAULT_SCALE
 

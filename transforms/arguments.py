@@ -1,34 +1,53 @@
 """What everything that puts a map before an environment makes of its arguments; TorchRL is not needed for it."""
 
+from __future__ import annotations
+
 import copy
 from collections.abc import Sequence
+from pathlib import Path
 
-import torch
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
 
-from nht import ActionMap
+from nht import ActionMap, load_map
+from nht.saturation import Saturation
+
+MapOrFile = ActionMap | str | Path
 
 
-def frozen_copy(map: ActionMap) -> ActionMap:
-    """A copy of the map in eval mode, its parameters without gradients."""
-    return copy.deepcopy(map).requires_grad_(False).eval()
-
-
-def resolve_action_scale(map: ActionMap, given: float | None) -> Tensor:
-    """What an action of 1 stands for: a scalar tensor of the map's dtype, on its device.
+def take_map(
+    map: MapOrFile,
+    action_scale: float | Tensor | None = None,
+    saturation: Saturation | None = None,
+    allow: Sequence[str] = (),
+) -> ActionMap:
+    """A map of one's own, from a map or its file: frozen and in eval mode, with scale and saturation laid over.
 
     Args:
-        map: whose own scale holds where none is given.
-        given: in the map's own units.
+        map: a map, of which this is a copy, or the path of a file of ``nht.save_map``.
+        action_scale: what a policy's action of 1 stands for, in the map's own units. None leaves the map's.
+        saturation: ``"scale"`` or ``"clip"``. None leaves the map's.
+        allow: modules that may be imported for the class of a map in a file, see ``nht.load_map``.
 
     Raises:
-        ValueError: if it is not positive and finite.
+        TypeError: if ``map`` is neither.
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file is none of a map; if the action scale, given or the map's own, is not positive and
+            finite; on another saturation.
     """
-    scale = torch.as_tensor(map.action_scale if given is None else given)
-    if scale.ndim or not scale.isfinite() or scale <= 0:
-        raise ValueError(f"action_scale must be a positive, finite number, got {scale.tolist()}")
-    return scale.detach().to(map.action_scale, copy=True)
+    if isinstance(map, str | Path):
+        taken = load_map(map, allow=allow)
+    elif isinstance(map, ActionMap):
+        taken = copy.deepcopy(map)
+    else:
+        raise TypeError(
+            f"map must be an nht.ActionMap, or the path of a map's file, got {type(map).__name__}."
+        )
+    taken.requires_grad_(False).eval()
+    taken.set_action_scale(taken.action_scale if action_scale is None else action_scale)
+    if saturation is not None:
+        taken.saturation = saturation
+    return taken
 
 
 def resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> list[NestedKey]:
@@ -36,26 +55,37 @@ def resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> l
 
     Args:
         map: whose own keys hold where none are given.
-        given: keys; a nested one is a tuple within a list.
+        given: keys; a nested one is a tuple, or a list as in JSON and YAML, within a list.
 
     Raises:
-        TypeError: if `map` is no ActionMap.
         ValueError: if there are none but the map needs some, or the other way round, or if they are those of the
             map in another order.
     """
-    if not isinstance(map, ActionMap):
-        raise TypeError(f"map must be an nht.ActionMap, got {type(map).__name__}")
     own = None if map.context_keys is None else [unravel_key(key) for key in map.context_keys]
     if given is None:
         if own is None and map.context_dim:
             raise ValueError(
                 f"context_keys must name the entries that make up the map's context of {map.context_dim}: "
-                "the map does not know them, as it was not trained on demonstrations"
+                "the map does not know them, as it was not trained on demonstrations."
             )
         return own if own and map.context_dim else []
-    keys = [unravel_key(key) for key in ([given] if isinstance(given, str) else given)]
+    listed = [given] if isinstance(given, str) else given
+    keys = [unravel_key(key if isinstance(key, str) else tuple(key)) for key in listed]
     if own is not None and keys != own and set(keys) == set(own):
-        raise ValueError(f"the map was trained on context_keys {own}, in this order; got {keys}")
+        raise ValueError(f"the map was trained on context_keys {own}, in this order; got {keys}.")
     if bool(keys) != bool(map.context_dim):
-        raise ValueError(f"the map's context has {map.context_dim} entries, got context_keys {keys}")
+        raise ValueError(f"the map's context has {map.context_dim} entries, got context_keys {keys}.")
     return keys
+
+
+def check_distinct(action_keys: set[NestedKey], context_key: NestedKey, executed_key: NestedKey) -> None:
+    """No two entries have one key, but that the policy's action may stand where the actuation does.
+
+    Raises:
+        ValueError: if two have.
+    """
+    if context_key == executed_key or {context_key, executed_key} & action_keys:
+        raise ValueError(
+            f"context_key {context_key!r} and executed_key {executed_key!r} must differ from each other and "
+            f"from the action's keys, {', '.join(sorted(map(repr, action_keys)))}."
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from copy import deepcopy
 from dataclasses import dataclass, field
 
@@ -14,55 +13,38 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 from torchrl.objectives import DDPGLoss
 
+from nht.recipes.agents.critics import critic_network
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import HalfPrecisionMLP
-from nht.recipes.agents.returns import UNBOUNDED, Range, return_range, reward_range
+from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig
+from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.table import Algorithm
-from nht.recipes.sections import AlgoConfig, Training
+from nht.recipes.sections import Training
 
 
 @dataclass
-class DDPGConfig(AlgoConfig):
+class DDPGConfig(OffPolicyConfig):
     """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
 
+    frames_per_batch: int = 200
     updates_per_batch: int = 20
-    warmup_frames: int = 2_000  # collected before the first update
-    random_frames: int = 0  # the first ones, whose actions are uniform
-    batch_size: int = 256
-    buffer_size: int = 1_000_000
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
+    warmup_frames: int = 2_000
+    random_frames: int = 0
+    gamma: float = 0.98
+    polyak: float = 0.96
     actor_learning_rate: float = 1e-3
     critic_learning_rate: float = 1e-3
-    gamma: float = 0.98
-    n_steps: int = (
-        1  # rewards that a target adds up before it trusts the critic, within a batch of the collector
-    )
-    polyak: float = 0.96  # share of the old target network that stays at each move
     target_update_every: int = 1  # gradient steps between two moves of the target networks
     action_l2: float = 0.05  # weight of the mean squared action in the actor's loss
     exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
     noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
     random_action: float = 0.1  # probability of a uniform action instead
-    pessimism: float = 0.8  # the critic starts at this times the lowest return that is possible
-    observation_clip: float = 5.0  # of the normalised observation
-    bfloat16: bool = False  # the precision of hidden layers' matrix products; weights stay float32
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""
-        if not 0 < self.gamma < 1:
-            raise ValueError(f"algo.gamma must lie in (0, 1), got {self.gamma}.")
-        for name in ("polyak", "random_action", "pessimism"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"algo.{name} must lie in [0, 1], got {getattr(self, name)}.")
-        counts = ("total_frames", "frames_per_batch", "n_steps", "batch_size", "buffer_size")
-        for name in (*counts, "target_update_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"algo.{name} must be at least 1, got {getattr(self, name)}.")
-        for name in ("action_l2", "exploration_noise", "updates_per_batch", "warmup_frames", "random_frames"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"algo.{name} must not be negative, got {getattr(self, name)}.")
-        if self.noise_memory < 1:
-            raise ValueError(f"algo.noise_memory must be at least 1 step, got {self.noise_memory}.")
+        super().__post_init__()
+        self._check_unit("random_action")
+        self._check_least(1, "target_update_every", "noise_memory")
+        self._check_least(0, "action_l2", "exploration_noise")
 
 
 @dataclass
@@ -85,13 +67,10 @@ def networks(env: EnvBase, algo: DDPGConfig) -> tuple[TensorDictModule, TensorDi
     hidden = {"num_cells": list(algo.hidden), "activation_class": nn.ReLU, "device": env.device}
     network = HalfPrecisionMLP if algo.bfloat16 else MLP
     actor = nn.Sequential(network(size, action_dim, **hidden), nn.Tanh())
-    critic = network(size + action_dim, 1, **hidden)
-    lowest, _ = return_range(reward_range(env), algo.gamma)
-    nn.init.constant_(critic[-1].bias, algo.pessimism * lowest if math.isfinite(lowest) else 0.0)
     return (
         TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
         TensorDictModule(actor, in_keys=["features"], out_keys=["action"]),
-        TensorDictModule(critic, in_keys=["features", "action"], out_keys=["state_action_value"]),
+        critic_network(env, algo),
     )
 
 

@@ -7,7 +7,7 @@ import math
 import torch
 from tensordict import TensorDictBase
 from torchrl.data.postprocs import MultiStep
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 Range = tuple[float, float]
 """Smallest and largest value."""
@@ -15,12 +15,10 @@ UNBOUNDED: Range = (-math.inf, math.inf)
 
 
 def reward_range(env: EnvBase) -> Range:
-    """Smallest and largest reward of a step, as the environment's spec has it; infinite where it knows none."""
-    space = env.reward_spec.space
-    # TorchRL writes "unbounded" as the largest numbers of the type.
-    low, high = float(space.low.min()), float(space.high.max())
-    largest = torch.finfo(env.reward_spec.dtype).max
-    return (low if low > -largest else -math.inf), (high if high < largest else math.inf)
+    """Smallest and largest reward of a step, as the simulation behind ``env`` knows it; infinite where unknown."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    found: Range = getattr(getattr(base, "task", None), "reward_range", UNBOUNDED)
+    return found
 
 
 def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> Range:

@@ -41,7 +41,7 @@ def _adopt(name: str, found: Any) -> Algorithm:
 
 ALGORITHMS: Table[Algorithm] = Table(
     "nht.algorithms",
-    {name: f"nht.recipes.agents.{name}:ALGORITHM" for name in ("ddpg", "ppo")},
+    {name: f"nht.recipes.agents.{name}:ALGORITHM" for name in ("ddpg", "td3", "sac", "ppo")},
     _adopt,
 )
 """Every algorithm by the name of its recipe; packages add theirs as entry points ``nht.algorithms``."""

@@ -97,8 +97,10 @@ def _configured(map: nht.ActionMap, settings: MapConfig) -> nht.ActionMap:
     """A map with the corrections and the action scale that are asked for: from here on they are its own."""
     if settings.residual is not None and not isinstance(map, nht.Residual):
         map = nht.Residual(map, settings.residual)
+    if settings.saturation is not None:
+        map.saturation = settings.saturation  # type: ignore[assignment]  # the setter checks it
     if (scale := default_scale(settings)) is not None:
-        map.action_scale.fill_(scale)
+        map.set_action_scale(scale)
     return map
 
 
@@ -113,7 +115,7 @@ def load_kind(settings: MapConfig) -> nht.ActionMap:
         ValueError: if it is of another kind or has other corrections, for a run would carry the wrong name.
     """
     path, kind = settings.file or "", find_kind(settings.kind)
-    map = nht.load_map(path)
+    map = nht.load_map(path, allow=settings.allow)
     core = map
     if isinstance(map, nht.Residual):
         core = map.map
@@ -128,7 +130,7 @@ def load_kind(settings: MapConfig) -> nht.ActionMap:
     scale = None if settings.scale_is_set or format_version(path) == 1 else float(map.action_scale)
     map = _configured(map, settings)
     if scale is not None:
-        map.action_scale.fill_(scale)
+        map.set_action_scale(scale)
     return map
 
 

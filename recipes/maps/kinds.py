@@ -13,7 +13,9 @@ from nht.envs.registry import TaskRecord, find_task
 from nht.envs.table import Table
 from nht.recipes.sections import DEFAULT_SCALE, EnvConfig, MapConfig
 
-NETWORK_SETTINGS = ("hidden", "activation", "multi_head", "lipschitz", "beta_kl", "beta_dynamics")
+NETWORK_SETTINGS = ("hidden", "activation", "multi_head", "start", "lipschitz", "beta_kl", "beta_dynamics")
+"""Settings of ``map`` that shape networks: a kind without one passes over them."""
+SETTINGS = (*NETWORK_SETTINGS, "offset")
 """Settings of ``map`` that are handed to a kind's constructor if it takes arguments of these names."""
 
 
@@ -170,7 +172,7 @@ def make_map(
         "action_dim": map.action_dim,
         "seed": seed,
     }
-    given |= {name: getattr(map, name) for name in NETWORK_SETTINGS} | map.args
+    given |= {name: getattr(map, name) for name in SETTINGS} | map.args
     build = kind.build or kind.map_class
     taken = inspect.signature(build).parameters
     if kind.needs_arm:
@@ -192,10 +194,9 @@ def _check_options(map: MapConfig, taken: list[str]) -> None:
     """A kind without a network passes over what shapes networks; any other kind must have what is asked for."""
     if unknown := sorted(map.args.keys() - taken):
         raise ValueError(f"map.args {unknown} are not arguments of {map.kind!r}, which takes {taken}.")
-    if "hidden" not in taken:
-        return
+    asked = SETTINGS if "hidden" in taken else SETTINGS[len(NETWORK_SETTINGS) :]
     unset = {entry.name: entry.default for entry in fields(MapConfig)}
-    for name in NETWORK_SETTINGS:
+    for name in asked:
         if name not in taken and getattr(map, name) != unset[name] and name not in ("hidden", "activation"):
             having = [kind for kind in KINDS if name in inspect.signature(KINDS[kind].map_class).parameters]
             raise ValueError(f"map.{name} is an option of {' and '.join(having)}, not of {map.kind!r}.")

@@ -22,10 +22,10 @@ import nht
 from nht.reading import shortened
 from nht.recipes.agents.table import find_algorithm, name_of
 from nht.recipes.maps.interface import run_map
-from nht.recipes.maps.kinds import default_scale, map_context_keys
+from nht.recipes.maps.kinds import default_scale, find_kind, map_context_keys
 from nht.recipes.run.config_file import check_code, read_settings
 from nht.recipes.run.dashboard import Dashboard, open_dashboard
-from nht.recipes.run.environments import check_env
+from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
 from nht.recipes.run.metrics_file import read_metrics
 from nht.recipes.run.ownership import claimed, owner_of
@@ -113,7 +113,9 @@ class RunFolder:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
         if not (kept := self.path / MAP_FILE).exists():
-            nht.save_map(run_map(self.config, motors), kept)
+            map = run_map(self.config, motors)
+            mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
+            nht.save_map(map, kept)
         self._dashboard = open_dashboard(self.path, self.config)
 
     def _look(self) -> None:
@@ -250,10 +252,23 @@ def _read(settings: Path, allow: Sequence[str] = ()) -> tuple[str, Training]:
         raise ValueError(f"{settings} is no configuration of a run: {shortened(error)}.") from error
 
 
-def kept_map(folder: Path, config: Training, device: torch.device | str = "cpu") -> nht.ActionMap:
-    """The action map of a run; of one that an earlier version made, with the scale that its configuration has."""
+def kept_map(
+    folder: Path, config: Training, device: torch.device | str = "cpu", allow: Sequence[str] = ()
+) -> nht.ActionMap:
+    """The action map of a run; of one that an earlier version made, with the scale that its configuration has.
+
+    Args:
+        folder: of the run.
+        config: of the run.
+        device: where the map goes.
+        allow: packages whose classes the map's file may name, beside that of the kind of map.
+
+    Raises:
+        FileNotFoundError, ValueError: as ``nht.load_map``.
+    """
     path = folder / MAP_FILE
-    map = nht.load_map(path, device=device)
+    own = find_kind(config.map.kind).map_class.__module__  # the configuration names it
+    map = nht.load_map(path, device=device, allow=[*allow, own])
     scale = config.map.action_scale
     if format_version(path) == 1 and config.map.scale_is_set and scale is not None:
         map.action_scale.fill_(scale)

@@ -13,9 +13,7 @@ from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from nht.envs import BatchedTask
-from nht.envs.foreign import ForeignTask
-from nht.envs.rendering import ForeignRenderer, SceneRenderer
+from nht.envs.simulation import Simulation
 from nht.recipes.run.evaluation import Evaluation, Policy, evaluate
 
 Picture = NDArray[np.uint8]
@@ -64,15 +62,13 @@ class Film:
         frames_per_second: at which the film runs at the speed of real time.
     """
 
-    def __init__(self, task: BatchedTask | ForeignTask) -> None:
+    def __init__(self, task: Simulation) -> None:
         self.frames: list[list[Picture]] = []
         steps_per_second = 1 / task.time_per_step
         self._every = math.ceil(steps_per_second / SMOOTH)
         self.frames_per_second = steps_per_second / self._every
         self._seconds_per_step = task.time_per_step
-        self._renderer = (
-            ForeignRenderer(task, *TILE) if isinstance(task, ForeignTask) else SceneRenderer(task, *TILE)
-        )
+        self._renderer = task.renderer(*TILE)
         self._trail: list[NDArray[np.float64]] = []
         self._steps = 0
         self._running = np.ones(task.num_envs, dtype=bool)

@@ -16,19 +16,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
+from nht.recipes.maps.kinds import KINDS
 from nht.recipes.study.results import SearchResults
 from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
-COLOURS = {
-    "nht": "#0072B2",
-    "laser": "#E69F00",
-    "svd": "#009E73",
-    "scl": "#CC79A7",
-    "jacobian": "#56B4E9",
-    "raw": "#666666",
-}
-"""Okabe and Ito's, which the colour-blind can tell apart; the same in every figure."""
-OTHERS = ("#D55E00", "#A6761D", "#7570B3")
+OTHERS = ("#A6761D", "#7570B3", "#E7298A")
+"""Colours of interfaces whose kind of map has none of its own."""
 REPEATABLE: Any = {"svg.hashsalt": "nht", "savefig.dpi": 150, "font.size": 10}
 BAND_RESAMPLES = 500
 
@@ -58,8 +51,10 @@ def draw_all(results: SearchResults, out: Path) -> list[Figure]:
 
 
 def colour(interface: str) -> str:
-    """Of an interface, known or not."""
-    return COLOURS.get(interface) or OTHERS[sum(interface.encode()) % len(OTHERS)]
+    """The colour of an interface, the same in every figure: that of its kind of map, or one that its name decides."""
+    kind = "none" if interface == "raw" else interface
+    known = KINDS[kind].colour if kind in list(KINDS) else None
+    return known or OTHERS[sum(interface.encode()) % len(OTHERS)]
 
 
 def _line(interface: str) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def test_rewards_know_their_bounds(env):
 
 def test_episodes_end_though_the_suite_knows_no_limit(monkeypatch):
     monkeypatch.setattr(foreign, "LONGEST_EPISODE", 4)
-    with closing(make_dm_control("lqr-lqr_2_1")) as env:
+    with closing(make_dm_control("lqr-lqr_2_1", seed=0)) as env:
         assert env.task.max_episode_steps == 4
         data = env.rollout(9, break_when_any_done=False)["next"]
         assert data["truncated"].flatten().nonzero().flatten().tolist() == [3, 7]
@@ -157,14 +157,16 @@ def test_the_command_line_names_domain_and_task():
 
 def test_unknown_names():
     with pytest.raises(ValueError, match=r"no domain 'cheeta', as in 'cheeta-run': .*'cheetah'.*'walker'"):
-        make_dm_control("cheeta-run")
+        make_dm_control("cheeta-run", seed=0)
     with pytest.raises(
         ValueError, match=r"no task 'walker-fly': .*\['walker-run', 'walker-stand', 'walker-walk'\]"
     ):
-        make_dm_control("walker-fly")
+        make_dm_control("walker-fly", seed=0)
     with pytest.raises(ValueError, match=r"no task 'walker': the domain 'walker' has"):
-        make_dm_control("walker")
-    with pytest.raises(ValueError, match=r"unknown env.suite 'dmc': .*\['nht', 'dm_control', 'gymnasium'\]"):
+        make_dm_control("walker", seed=0)
+    with pytest.raises(
+        ValueError, match=r"unknown env.suite 'dmc': .*\['nht', 'dm_control', 'gymnasium', 'torchrl'\]"
+    ):
         base_env(EnvConfig("cheetah-run", "dmc"), seed=0)
 
 
@@ -176,7 +178,7 @@ def test_a_context_key_that_the_task_lacks():
 
 def test_settings_that_make_no_sense():
     with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
-        make_dm_control("reacher-easy", num_envs=0)
+        make_dm_control("reacher-easy", num_envs=0, seed=0)
     with pytest.raises(ValueError, match=r"steps its copies in one thread, got env.num_threads=2"):
         base_env(EnvConfig("reacher-easy", "dm_control", num_threads=2), seed=0)
 
@@ -185,17 +187,17 @@ def test_an_extra_that_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "dm_control", None)
     monkeypatch.setitem(sys.modules, "dm_control.suite", None)
     with pytest.raises(ImportError, match=r"pip install 'nht\[dm_control\]'"):
-        make_dm_control("cheetah-run")
+        make_dm_control("cheetah-run", seed=0)
     with pytest.raises(ImportError, match=r"pip install 'nht\[dm_control\]'"):
-        nht.envs.make_env("cheetah_run")
+        nht.envs.make_env("cheetah_run", seed=0)
 
 
 def test_neither_importing_nor_making_needs_a_way_to_render():
     code = """
 import sys, nht.envs
 assert not {"dm_control", "gymnasium_robotics"} & set(sys.modules), "imported though nobody asked"
-nht.envs.make_dm_control("reacher-easy").rollout(2)
-nht.envs.make_env("cheetah_run").rollout(2)
+nht.envs.make_dm_control("reacher-easy", seed=0).rollout(2)
+nht.envs.make_env("cheetah_run", seed=0).rollout(2)
 """
     command = [sys.executable, "-c", code]
     without = {"MUJOCO_GL": "disable", "PATH": ""}

@@ -67,7 +67,7 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_specs(name, num_envs):
-    env = make_env(name, num_envs=num_envs)
+    env = make_env(name, num_envs=num_envs, seed=0)
     check_env_specs(env)
     assert env.batch_size == (num_envs,)
     assert env.action_spec.shape == (num_envs, env.task.actuation_bounds[0].size)
@@ -88,7 +88,7 @@ def test_shared_options_and_gymnasium_id(name):
 
 
 def test_no_observation_entry_is_constant(name):
-    env = make_env(name, num_envs=16, max_episode_steps=10)
+    env = make_env(name, num_envs=16, max_episode_steps=10, seed=0)
     data = play(env, random_actions(env, 30)).flatten()
     constant = {
         (key, entry)
@@ -102,7 +102,7 @@ def test_no_observation_entry_is_constant(name):
 
 
 def test_flags_agree(name):
-    env = make_env(name, num_envs=32, max_episode_steps=20)
+    env = make_env(name, num_envs=32, max_episode_steps=20, seed=0)
     data = play(env, random_actions(env, 60))["next"]
     assert torch.equal(data["done"], data["terminated"] | data["truncated"])
     assert not (data["success"] & data["failure"]).any()
@@ -111,7 +111,7 @@ def test_flags_agree(name):
 
 
 def test_actuation_is_clipped_to_its_bounds(name):
-    env, wild = make_env(name, num_envs=2), make_env(name, num_envs=2)
+    env, wild = make_env(name, num_envs=2, seed=0), make_env(name, num_envs=2, seed=0)
     low, high = (torch.tensor(bound, dtype=torch.float32) for bound in env.task.actuation_bounds)
     for within, beyond in [(high, high + 100), (low, low - 100)]:
         data, other = (play(each, bound.expand(3, 2, -1)) for each, bound in [(env, within), (wild, beyond)])
@@ -119,7 +119,7 @@ def test_actuation_is_clipped_to_its_bounds(name):
 
 
 def test_golden_first_steps(name):
-    env = make_env(name, num_envs=2)
+    env = make_env(name, num_envs=2, seed=0)
     env.set_seed(0)
     data = play(env, random_actions(env, 3))["next"]
     observation, rewards = golden(name)["observation"], golden(name)["rewards"]
@@ -141,7 +141,7 @@ def test_a_seed_repeats_the_trajectory(name):
 
 
 def test_each_seed_and_each_reset_acts(name):
-    env = make_env(name, num_envs=2)
+    env = make_env(name, num_envs=2, seed=0)
     starts = [make_env(name, num_envs=2, seed=seed).reset() for seed in (1, 2)]
     for seed in (11, 12):
         env.set_seed(seed)
@@ -150,13 +150,15 @@ def test_each_seed_and_each_reset_acts(name):
 
 
 def test_number_of_threads_does_not_matter(name):
-    one, two = (make_env(name, num_envs=5, num_threads=threads, max_episode_steps=8) for threads in (1, 2))
+    one, two = (
+        make_env(name, num_envs=5, num_threads=threads, max_episode_steps=8, seed=0) for threads in (1, 2)
+    )
     actions = random_actions(one, 20)
     assert_same(play(one, actions), play(two, actions))
 
 
 def test_a_batch_equals_single_copies(name):
-    batch = make_env(name, num_envs=4)
+    batch = make_env(name, num_envs=4, seed=0)
     play(batch, random_actions(batch, 5))
     saved = batch.task.state_dict()
     actions = random_actions(batch, 10, seed=1)
@@ -175,7 +177,7 @@ def row_of(saved, row):
 
 
 def test_goes_on_from_a_saved_state(name):
-    env = make_env(name, num_envs=3, max_episode_steps=8)
+    env = make_env(name, num_envs=3, max_episode_steps=8, seed=0)
     actions = random_actions(env, 30)
     play(env, actions[:5])
     saved, observed = pickle.dumps(env.task.state_dict()), env.task.observe()
@@ -193,7 +195,7 @@ def test_goes_on_from_a_saved_state(name):
 
 
 def test_a_reset_after_loading_is_a_reset(name):
-    env = make_env(name, num_envs=2)
+    env = make_env(name, num_envs=2, seed=0)
     play(env, random_actions(env, 1))
     before = env.task.state_dict()
     env.task.load_state_dict(before)
@@ -206,7 +208,7 @@ def test_a_reset_after_loading_is_a_reset(name):
 
 
 def test_partial_reset_touches_its_rows_only(name):
-    env = make_env(name, num_envs=4)
+    env = make_env(name, num_envs=4, seed=0)
     before = play(env, random_actions(env, 3))["next"][-1]
     state = env.task.state_dict()
     mask = torch.tensor([False, True, False, True])
@@ -221,7 +223,7 @@ def test_partial_reset_touches_its_rows_only(name):
 
 
 def test_a_reset_of_no_copy_changes_nothing(name):
-    task = make_env(name, num_envs=2).task
+    task = make_env(name, num_envs=2, seed=0).task
     before = task.state.copy(), task.rng.bit_generator.state
     task.reset(np.array([], dtype=np.intp))
     np.testing.assert_array_equal(task.state, before[0])
@@ -229,10 +231,10 @@ def test_a_reset_of_no_copy_changes_nothing(name):
 
 
 def test_a_finished_copy_starts_anew_and_its_last_observation_stays(name):
-    env = make_env(name, num_envs=3, max_episode_steps=10)
+    env = make_env(name, num_envs=3, max_episode_steps=10, seed=0)
     tensordict = env.reset()
     env.task.steps[1] = 9
-    reference = make_env(name, num_envs=3)
+    reference = make_env(name, num_envs=3, seed=0)
     reference.task.load_state_dict(env.task.state_dict())
     action = random_actions(env, 1)[0]
     frame, after = env.step_and_maybe_reset(tensordict.set("action", action))
@@ -247,7 +249,7 @@ def test_a_finished_copy_starts_anew_and_its_last_observation_stays(name):
 
 def test_returned_tensors_belong_to_the_caller(name):
     """Neither does a later step write into them, nor does the environment read them again."""
-    env, vandalised = (make_env(name, num_envs=3, max_episode_steps=4) for _ in range(2))
+    env, vandalised = (make_env(name, num_envs=3, max_episode_steps=4, seed=0) for _ in range(2))
     for each in (env, vandalised):
         each.task.steps[1] = 2  # so that copies finish at different steps
     actions = random_actions(env, 12)
@@ -268,8 +270,8 @@ def test_returned_tensors_belong_to_the_caller(name):
 
 
 def test_returned_arrays_belong_to_the_caller(name):
-    task = make_env(name, num_envs=3).task
-    actuation = random_actions(make_env(name, num_envs=3), 1)[0].numpy()
+    task = make_env(name, num_envs=3, seed=0).task
+    actuation = random_actions(make_env(name, num_envs=3, seed=0), 1)[0].numpy()
     outcome = task.step(actuation)
     kept = task.observe() | vars(outcome)
     copies = {key: values.copy() for key, values in kept.items()}
@@ -281,7 +283,7 @@ def test_returned_arrays_belong_to_the_caller(name):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_an_action_that_is_not_finite_fails_its_copy_only(name, value):
-    env, healthy = make_env(name, num_envs=3), make_env(name, num_envs=3)
+    env, healthy = make_env(name, num_envs=3, seed=0), make_env(name, num_envs=3, seed=0)
     actions = random_actions(env, 6)
     expected = play(healthy, actions)
     actions[2, 1, -1] = value
@@ -292,7 +294,7 @@ def test_an_action_that_is_not_finite_fails_its_copy_only(name, value):
 
 @pytest.mark.parametrize("num_threads", [1, 2])
 def test_diverged_physics_fails_its_copy_only(name, num_threads):
-    env, healthy = (make_env(name, num_envs=3, num_threads=num_threads) for _ in range(2))
+    env, healthy = (make_env(name, num_envs=3, num_threads=num_threads, seed=0) for _ in range(2))
     actions = random_actions(env, 6)
     expected = play(healthy, actions)
     before = play(env, actions[:2])
@@ -303,7 +305,7 @@ def test_diverged_physics_fails_its_copy_only(name, num_threads):
 
 
 def test_a_diverged_copy_stays_where_it_was(name):
-    env = make_env(name, num_envs=2)
+    env = make_env(name, num_envs=2, seed=0)
     env.task.qpos[0] = 1e12
     for action in random_actions(env, 2):
         assert env.task.step(action.numpy()).diverged.tolist() == [True, False]
@@ -322,7 +324,7 @@ def assert_one_copy_failed(data, expected, row, step):
 
 
 def test_the_time_limit_truncates_and_does_not_terminate(name):
-    env = make_env(name, num_envs=2, max_episode_steps=5)
+    env = make_env(name, num_envs=2, max_episode_steps=5, seed=0)
     still = torch.zeros_like(random_actions(env, 10))
     data = play(env, still)["next"]
     assert data["truncated"][:, 0, 0].tolist() == ([False] * 4 + [True]) * 2
@@ -334,7 +336,7 @@ def test_the_time_limit_truncates_and_does_not_terminate(name):
 
 
 def test_closing(name):
-    env = make_env(name, num_threads=2)
+    env = make_env(name, num_threads=2, seed=0)
     tensordict = env.rand_action(env.reset())
     env.close()
     env.close()
@@ -346,7 +348,7 @@ def test_closing(name):
 
 
 def test_wrong_action_shape(name):
-    env = make_env(name, num_envs=2)
+    env = make_env(name, num_envs=2, seed=0)
     size = env.action_spec.shape[-1]
     with pytest.raises(ValueError, match=rf"\(2, {size}\), got \(2, {size + 1}\)"):
         env.step(env.reset().set("action", torch.zeros(2, size + 1)))
@@ -357,14 +359,14 @@ def test_wrong_action_shape(name):
 @pytest.mark.parametrize("option", ["num_envs", "num_threads", "max_episode_steps"])
 def test_counts_below_one(name, option):
     with pytest.raises(ValueError, match=f"{option} must be at least 1, got 0"):
-        make_env(name, **{option: 0})
+        make_env(name, seed=0, **{option: 0})
 
 
 def test_unknown_names(name):
     with pytest.raises(ValueError, match=rf"unknown environment 'nonesuch'.*{name}"):
-        make_env("nonesuch")
+        make_env("nonesuch", seed=0)
     with pytest.raises(ValueError, match=rf"{name} got an unexpected .*'nonesuch': .*max_episode_steps"):
-        make_env(name, nonesuch=1)
+        make_env(name, nonesuch=1, seed=0)
     with pytest.raises(ValueError, match=rf"'nonesuch' has no scripted expert.*{sorted(EXPERTS)[0]}"):
         make_expert("nonesuch")
     with pytest.raises(ValueError, match="unexpected keyword argument 'nonesuch'"):
@@ -373,7 +375,7 @@ def test_unknown_names(name):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_device(name):
-    on_gpu, on_cpu = make_env(name, num_envs=2, device="cuda"), make_env(name, num_envs=2)
+    on_gpu, on_cpu = make_env(name, num_envs=2, device="cuda", seed=0), make_env(name, num_envs=2, seed=0)
     check_env_specs(on_gpu)
     actions = random_actions(on_cpu, 5)
     data = play(on_gpu, actions.cuda())

@@ -63,7 +63,7 @@ def test_spaces(name, env):
 
 
 def test_agrees_with_the_batched_environment(name):
-    single, batched = gymnasium.make(gymnasium_id(name), max_episode_steps=None), make_env(name)
+    single, batched = gymnasium.make(gymnasium_id(name), max_episode_steps=None), make_env(name, seed=0)
     for env in (single.unwrapped, batched):
         env.task.max_episode_steps = 20  # short enough for those who fall
     single.action_space.seed(0)

@@ -9,6 +9,8 @@ import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
 
 from nht.envs import TASKS, GymnasiumEnv, GymnasiumVectorEnv, gymnasium_id, make_env
 
@@ -175,6 +177,65 @@ def test_a_seed_repeats_and_no_seed_does_not():
     assert not np.array_equal(*unseeded)
 
 
+@pytest.mark.parametrize("sequence", [list, tuple, np.array])
+def test_a_seed_for_each_copy(sequence):
+    """Each starts as a single environment does, and the episodes after that are repeatable."""
+    env, seeds = wipe(start="random", max_episode_steps=2), [5, 3, 5]
+    first = env.reset(seed=sequence(seeds))[0]
+    singles = [gymnasium.make(WIPE, start="random").reset(seed=seed)[0] for seed in seeds]
+    np.testing.assert_array_equal(first, singles)
+    later = play(env, 6)
+    again = env.reset(seed=seeds)[0]
+    np.testing.assert_array_equal(first, again)
+    for left, right in zip(later, play(env, 6), strict=True):
+        np.testing.assert_array_equal(left[0], right[0])
+    env.reset(seed=[5, 3, 6])
+    assert not np.array_equal(play(env, 3)[-1][0][:2], later[2][0][:2]), "all seeds make the later episodes"
+
+
+def test_a_copy_without_a_seed_starts_anywhere():
+    env = wipe(start="random")
+    starts = [env.reset(seed=[1, None, 1])[0] for _ in range(2)]
+    np.testing.assert_array_equal((starts[0] == starts[1]).all(axis=1), [True, False, True])
+    mask = np.array([False, False, True])
+    masked = env.reset(seed=[1, 2, 3], options={"reset_mask": mask})[0]
+    np.testing.assert_array_equal(masked[:2], starts[1][:2])
+
+
+@pytest.mark.parametrize("mode", ["SAME_STEP", "same_step", "SameStep", "same-step", AutoresetMode.SAME_STEP])
+def test_a_mode_may_be_written_as_it_is_written_elsewhere(mode):
+    assert wipe(autoreset_mode=mode).metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_torchrl_wraps_it(mode):
+    """The modes that ``GymWrapper`` takes."""
+    limits = {"max_episode_steps": 4, "seed": 7}
+    env = GymWrapper(gymnasium.make_vec(WIPE, num_envs=COPIES, autoreset_mode=mode, **limits))
+    check_env_specs(env)
+    env.set_seed(1)
+    batched = make_env("wam_wipe", num_envs=COPIES, max_episode_steps=4, seed=1)
+    batched.task.rng = env.unwrapped.task.rng
+    torch.manual_seed(0)
+    mine = env.rollout(10, break_when_any_done=False)
+    assert mine["next", "done"][..., 0].any(0).tolist() == [False, False, False, True] * 2 + [False] * 2
+    assert (mine["next", "observation"][:, 3] != mine["observation"][:, 4]).any(), "its own last observation"
+
+
+def test_copies_that_wait_are_not_stepped_along():
+    env = wipe(max_episode_steps=2)
+    env.reset(seed=0)
+    env.unwrapped.task.steps[1] = 1
+    play(env, 1)
+    ended = env.unwrapped.task.state[1].copy()
+    stepped = []
+    real = env.unwrapped.task.step
+    env.unwrapped.task.step = lambda actions, rows=None: stepped.append(rows) or real(actions, rows)
+    play(env, 1)
+    assert stepped[0].tolist() == [0, 2]
+    assert (env.unwrapped.task.state[1] != ended).any(), "it was reset"
+
+
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_a_masked_reset_touches_its_rows_only(mode):
     env = wipe(start="random", autoreset_mode=mode)
@@ -313,7 +374,7 @@ def test_closing_twice():
         ),
         (
             ValueError,
-            r"one of \['NextStep', 'SameStep', 'Disabled'\], got 'never'",
+            r"one of \['NextStep', 'SameStep', 'Disabled'\], or its name, got 'never'",
             {"autoreset_mode": "never"},
         ),
         (TypeError, "unexpected keyword argument 'nonesuch': its options are", {"nonesuch": 1}),
@@ -328,7 +389,9 @@ def test_wrong_options(error, message, options):
 @pytest.mark.parametrize(
     ("error", "message", "arguments"),
     [
-        (TypeError, r"one seed serves all 3 copies: it must be an int, got \[1, 2, 3\]", {"seed": [1, 2, 3]}),
+        (TypeError, r"seed must be an int, or 3 of them, got 'one'", {"seed": "one"}),
+        (TypeError, r"seed must be an int, or 3 of them, got \[1, 2.5, 3\]", {"seed": [1, 2.5, 3]}),
+        (ValueError, r"one for each of the 3 copies, got 2", {"seed": [1, 2]}),
         (TypeError, "array of bool, got list", {"options": {"reset_mask": [True, False, True]}}),
         (TypeError, "array of bool, got int64", {"options": {"reset_mask": np.array([1, 0, 1])}}),
         (ValueError, r"shape \(3,\)", {"options": {"reset_mask": np.array([True])}}),

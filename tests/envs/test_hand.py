@@ -74,8 +74,8 @@ def test_episodes_are_gymnasiums_own(env):
 
 
 def test_success_is_what_the_environment_says(monkeypatch):
-    with closing(make_gymnasium("AdroitHandRelocate-v1")) as env:
-        core = env.task.copies[0]._core
+    with closing(make_gymnasium("AdroitHandRelocate-v1", seed=0)) as env:
+        core = env.task.copies[0].core
         current = env.rand_action(env.reset())
         core.model.site_pos[core.target_obj_site_id] = core.data.xpos[core.obj_body_id]  # the ball is there
         assert env.step(current)["next", "success"].all()
@@ -128,16 +128,11 @@ def test_presets_and_raw_motors():
 
 def test_unknown_names():
     with pytest.raises(ValueError, match=r"no environment 'AdroitHandRelocat-v1'; .*'AdroitHandRelocate-v1'"):
-        make_gymnasium("AdroitHandRelocat-v1")
-
-
-def test_an_environment_without_mujoco():
-    with pytest.raises(ValueError, match="Pendulum-v1 is no MuJoCo environment"):
-        make_gymnasium("Pendulum-v1")
+        make_gymnasium("AdroitHandRelocat-v1", seed=0)
 
 
 def test_an_extra_that_is_not_installed(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
     monkeypatch.setattr(gymnasium, "registry", {})
     with pytest.raises(ImportError, match=r"pip install 'nht\[hand\]'"):
-        make_gymnasium("AdroitHandDoor-v1")
+        make_gymnasium("AdroitHandDoor-v1", seed=0)

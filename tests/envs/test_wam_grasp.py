@@ -31,7 +31,7 @@ BESIDE = grasp_point(np.array([0.5]), np.array([2.0]))[0]  # a grasp point
 
 
 def make_grasp(num_envs=1, **options):
-    return make_task("wam_grasp", num_envs=num_envs, **options)
+    return make_task("wam_grasp", num_envs=num_envs, seed=0, **options)
 
 
 # Collisions.

@@ -49,6 +49,7 @@ MAPS: dict[str, Callable[[], ActionMap]] = {
     ).double(),  # J J^T is too ill conditioned for 1e-6 in single precision
     "double": lambda: nht.NHT(10, 7, 3, (16,)).double(),
     "own": lambda: Own(),
+    "affine": lambda: nht.NHT(10, 7, 2, (16,), offset="contextual"),
 }
 SLOW = {
     ("svd", "onnx"),
@@ -119,6 +120,45 @@ def test_the_file_does_what_the_transform_does(
     expected = ActionMapTransform(map, ["joint_angle"], action_scale=action_scale).inv(data)["action"]
     torch.testing.assert_close(exported(action, context), expected, rtol=1e-6, atol=1e-6)
     assert not torch.allclose(expected, map(action, context), atol=0.1)
+
+
+LIMITS = {"low": [-0.3, -math.inf, -0.2, -1.0, -0.5, -0.5, -0.5], "high": 0.4}
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.mark.parametrize("saturation", ["scale", "clip"])
+@pytest.mark.parametrize("offset", ["none", "constant"])
+@torch.no_grad()
+def test_the_file_saturates_at_the_limits_that_it_was_given(
+    suffix: str, saturation: Any, offset: Any, tmp_path: Path
+) -> None:
+    map = nht.NHT(3, 7, 2, (8,), offset=offset)
+    map.saturation = saturation
+    map.set_action_scale(2.0)
+    if map.offset_model is not None:
+        map.offset_model.value.fill_(0.1)
+    path = nht.export_map(map, tmp_path / f"map.{suffix}", **LIMITS)
+    action, context = some(map, 64)
+    low, high = torch.tensor(LIMITS["low"]), torch.tensor(LIMITS["high"]).expand(7)
+    actuation = load(path)(action, context)
+    torch.testing.assert_close(actuation, map.decode(action, context, low, high), rtol=1e-6, atol=1e-6)
+    assert not torch.allclose(actuation, map.decode(action, context), atol=0.1)
+    diverged = load(path)(action.index_fill(0, torch.tensor(3), math.nan), context)
+    assert diverged[3].isnan().any()
+    assert diverged[4:].isfinite().all()
+    description = described(path)
+    assert description["saturation"] == saturation
+    assert description["high"] == pytest.approx([0.4] * 7)
+    assert description["low"][:2] == [pytest.approx(-0.3), None]
+
+
+def described(path: Path) -> dict[str, Any]:
+    if path.suffix == ".onnx":
+        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        return json.loads(session.get_modelmeta().custom_metadata_map["map"])
+    files = {"map": ""}
+    torch.export.load(path, extra_files=files)
+    return json.loads(files["map"])
 
 
 def test_a_process_that_knows_nothing_of_ours_runs_both_formats(tmp_path: Path) -> None:
@@ -223,6 +263,9 @@ def test_equations_of_other_shapes_are_refused() -> None:
         ("map.pt2", {"action_scale": 0.0}, "action_scale must be a positive, finite number, got 0.0"),
         ("map.pt2", {"action_scale": math.inf}, "action_scale must be a positive, finite number, got inf"),
         ("map.pt2", {"action_scale": math.nan}, "action_scale must be a positive, finite number, got nan"),
+        ("map.pt2", {"low": [0.0] * 6}, "low must be one number or 7, got"),
+        ("map.pt2", {"high": math.nan}, "high must be one number or 7, got nan"),
+        ("map.pt2", {"low": 1.0, "high": [0.0] * 7}, "low must not exceed high"),
     ],
 )
 def test_bad_arguments_are_refused(name: str, options: dict[str, Any], message: str, tmp_path: Path) -> None:

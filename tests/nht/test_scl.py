@@ -121,7 +121,9 @@ def test_the_environment_survives_a_basis_of_any_norm(size: float) -> None:
     for parameter in map.network.linear(-1).parameters():
         parameter.mul_(size)
     transform = ActionMapTransform(map, ["tool_position", "joint_angle"], action_scale=1.0)
-    steps = TransformedEnv(make_env("wam_wipe", num_envs=2), transform).rollout(20, break_when_any_done=False)
+    steps = TransformedEnv(make_env("wam_wipe", num_envs=2, seed=0), transform).rollout(
+        20, break_when_any_done=False
+    )
     assert steps["next", "observation"].isfinite().all()
     assert steps["next", "actuation"].abs().max() == 2  # the joints' largest speed
 

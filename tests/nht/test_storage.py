@@ -14,7 +14,7 @@ from torch import Tensor
 
 import nht
 from nht.maps import ActionMap
-from nht.storage import load_map, save_map
+from nht.storage import _checksum, load_map, save_map
 
 KEYS = ("tool_position", ("arm", "joint_angle"))
 
@@ -38,6 +38,7 @@ def trained(map: ActionMap) -> ActionMap:
     generator = torch.Generator().manual_seed(0)
     for value in map.state_dict().values():
         value.copy_(torch.rand(value.shape, generator=generator))
+    map.saturation = "scale"
     map.context_keys = KEYS
     map.data_fingerprint = "abc"
     return map
@@ -62,6 +63,7 @@ def test_maps_come_back_bit_for_bit(make: Callable[[], ActionMap], tmp_path: Pat
     assert loaded.init_args() == map.init_args()
     assert loaded.context_keys == KEYS
     assert loaded.data_fingerprint == "abc"
+    assert loaded.saturation == "scale"
     weights, expected = loaded.state_dict(), map.state_dict()
     assert weights.keys() == expected.keys()
     for name, value in expected.items():
@@ -88,9 +90,10 @@ def test_the_header_explains_the_file_without_this_package(tmp_path: Path) -> No
     with safe_open(save_map(map, tmp_path / "map.safetensors"), "pt") as file:
         metadata = file.metadata()
     assert metadata["format"] == "nht.action_map"
-    assert metadata["format_version"] == "1"
+    assert metadata["format_version"] == "2"
     header = json.loads(metadata["map"])
-    assert header["class"] == "NHT"
+    assert (header["module"], header["class"]) == ("nht", "NHT")
+    assert header["saturation"] == map.saturation
     assert header["init_args"]["hidden"] == [16, 8]
     assert header["context_keys"] == ["tool_position", ["arm", "joint_angle"]]
     assert (header["context_dim"], header["actuation_dim"], header["action_dim"]) == (10, 7, 2)
@@ -113,11 +116,13 @@ def test_saving_replaces_a_file_whole_or_not_at_all(tmp_path: Path, monkeypatch:
     save_map(nht.SVD(5, 2), path)
     assert load_map(path).actuation_dim == 5
 
-    def fail(_: Any, filename: Path, __: Any) -> None:
-        filename.write_bytes(b"half")
+    write = Path.write_bytes
+
+    def fail(file: Path, content: bytes) -> None:
+        write(file, content[: len(content) // 2])
         raise OSError("disk full")
 
-    monkeypatch.setattr("nht.storage.save_file", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(OSError, match="disk full"):
         save_map(nht.SVD(3, 2), path)
     assert load_map(path).actuation_dim == 5
@@ -136,14 +141,14 @@ def rewrite(
     description: dict[str, Any] | None = None,
     **tensors: Any,
 ) -> None:
-    """Changes parts of a map file; a tensor of None is left out."""
+    """Changes parts of a map file, its checksum with them; a tensor of None is left out."""
     with safe_open(path, "pt") as file:
         metadata = file.metadata()
     metadata["map"] = json.dumps(json.loads(metadata["map"]) | (description or {}))
+    metadata |= header or {}
     weights = load_file(path) | {name.replace("__", "."): value for name, value in tensors.items()}
-    save_file(
-        {name: value for name, value in weights.items() if value is not None}, path, metadata | (header or {})
-    )
+    weights = {name: value for name, value in weights.items() if value is not None}
+    save_file(weights, path, metadata | {"checksum": _checksum(metadata["map"], weights)})
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
@@ -182,10 +187,13 @@ def test_safetensors_files_of_others_are_refused(path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"header": {"format_version": "2"}}, "format version 2, this version of nht reads 1"),
+        ({"header": {"format_version": "3"}}, "format version 3, this version of nht reads 1 and 2"),
         ({"header": {"map": "{"}}, "its description is damaged"),
-        ({"header": {"map": "{}"}}, "its description is damaged: 'class'"),
-        ({"description": {"class": "Unheard"}}, "unknown class 'Unheard'; known are .*Identity.*NHT.*SVD"),
+        ({"header": {"map": "{}"}}, "its description is damaged: KeyError: 'module'"),
+        (
+            {"description": {"class": "Unheard"}},
+            "unknown class 'Unheard'; those of nht are .*Identity.*NHT.*SVD",
+        ),
         (
             {
                 "description": {
@@ -200,7 +208,12 @@ def test_safetensors_files_of_others_are_refused(path: Path) -> None:
             r"do not fit SVD: missing \['frame'\], unexpected \['network",
         ),
         (
-            {"description": {"class": "Residual", "init_args": {"map": {"class": "Path"}, "scale": 1}}},
+            {
+                "description": {
+                    "class": "Residual",
+                    "init_args": {"map": {"class": "Path", "module": "nht"}, "scale": 1},
+                }
+            },
             "unknown class 'Path'",
         ),
         (

@@ -129,7 +129,12 @@ def test_double_precision_maps_train_on_single_precision_data(demos: Demos) -> N
 def test_the_best_weights_are_kept_and_patience_ends_training(demos: Demos) -> None:
     rows: list[dict[str, float]] = []
     metrics = fit(
-        demos, small(), learning_rate=0.5, max_steps=20_000, patience=500, progress=rows.append
+        demos,
+        small(start="random"),
+        learning_rate=0.5,
+        max_steps=20_000,
+        patience=500,
+        progress=rows.append,
     ).metrics
     errors = {row["step"]: row["validation_error"] for row in rows}
     assert metrics["validation_error"] == min(errors.values()) == errors[int(metrics["best_step"])]

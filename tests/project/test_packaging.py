@@ -17,7 +17,9 @@ SOURCES = [  # of the packages, relative to the root
     file.relative_to(ROOT)
     for folder in FOLDERS.values()
     for file in sorted((ROOT / folder).rglob("*"))
-    if file.is_file() and "__pycache__" not in file.parts
+    if len(Path(folder).parts) == 1  # the others lie in these
+    and file.is_file()
+    and "__pycache__" not in file.parts
 ]
 RECIPES = [
     file.stem

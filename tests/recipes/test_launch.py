@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from nht.recipes.agents.sac import SAC
+from nht.recipes.agents.td3 import TD3
 from nht.recipes.config import DDPG, CollectDemos, CompareMaps, Evaluate, InspectDemos, Report, TrainMap
 from nht.recipes.launch import configure, launch
 
@@ -15,6 +17,8 @@ SCHEMAS = {
     "train_map": TrainMap,
     "compare_maps": CompareMaps,
     "ddpg": DDPG,
+    "sac": SAC,
+    "td3": TD3,
     "evaluate": Evaluate,
     "report": Report,
 }
@@ -54,9 +58,11 @@ def test_all_settings_of_the_papers_table_2_can_be_set():
     assert config.algo.critic_learning_rate == 1e-2
 
 
-@pytest.mark.parametrize("path", ["runs/demos", "it's (mine), {really}: $1 @ 5%/a b", "-", "a=b"])
+@pytest.mark.parametrize(
+    "path", ["runs/demos", "runs/lr=0.1/demos", "it's (mine), {really}: $1 @ 5%/a b", "-", "a=b"]
+)
 def test_a_word_without_a_key_sets_the_positional_setting(path, monkeypatch):
-    word = path if path[0] != "-" and "=" not in path else f"demos='{path}'"
+    word = path if path not in ("-", "a=b") else f"demos='{path}'"
     monkeypatch.setattr(sys, "argv", ["inspect_demos", word, "directions=3"])
     told = []
     launch(told.append, InspectDemos, "inspect_demos", positional="demos")

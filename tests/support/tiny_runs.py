@@ -5,7 +5,7 @@ import pandas
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 
-RECIPES = ("ddpg", "ppo")
+RECIPES = ("ddpg", "ppo", "sac", "td3")
 SHARED = [
     "env=wam_wipe",
     "map=none",
@@ -18,9 +18,12 @@ SHARED = [
     "run.checkpoint_every=200",
     "run.wandb=false",
 ]
+REPLAY = ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"]
 OWN = {
-    "ddpg": ["algo.updates_per_batch=3", "algo.warmup_frames=0", "algo.buffer_size=1000"],
+    "ddpg": REPLAY,
     "ppo": ["algo.minibatches=5", "algo.epochs=2"],
+    "sac": [*REPLAY, "algo.random_frames=200"],
+    "td3": [*REPLAY, "algo.random_frames=200"],
 }
 
 

@@ -9,11 +9,13 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP
 
-from nht.recipes import ddpg, ppo
+from nht.recipes import ppo
 from nht.recipes.agents.ddpg import PaperDDPGLoss
 from nht.recipes.agents.norm import ReturnNorm, RunningNorm
-from nht.recipes.agents.off_policy import JointSoftUpdate
+from nht.recipes.agents.off_policy import JointSoftUpdate, descend
 from nht.recipes.agents.ppo import GaussianActor, GaussianPPOLoss
+from nht.recipes.agents.sac import DirectSACLoss, GaussianHead, tanh_gaussian
+from nht.recipes.agents.td3 import DirectTD3Loss
 from nht.recipes.run.ranks import Ranks
 
 OBSERVATION, ACTION, BATCH, UPDATES = 5, 2, 64, 10
@@ -23,6 +25,11 @@ def networks(features):
     torch.manual_seed(0)
     norm = TensorDictModule(RunningNorm(OBSERVATION), ["observation"], ["features"])
     mean = MLP(OBSERVATION, ACTION, num_cells=[16, 16])
+    if features == "sac":
+        head = GaussianHead(MLP(OBSERVATION, 2 * ACTION, num_cells=[16, 16]))
+        return norm, tanh_gaussian(head), relu_critic()
+    if features == "td3":
+        return norm, TensorDictModule(nn.Sequential(mean, nn.Tanh()), ["features"], ["action"]), relu_critic()
     if features == "ppo":
         actor = TensorDictModule(
             GaussianActor(mean, ACTION, 0.5), ["features"], ["sample", "sample_log_prob", "action"]
@@ -34,6 +41,22 @@ def networks(features):
             MLP(OBSERVATION + ACTION, 1, num_cells=[16]), ["features", "action"], ["state_action_value"]
         )
     return norm, actor, critic
+
+
+def relu_critic():
+    critic = MLP(OBSERVATION + ACTION, 1, num_cells=[16], activation_class=nn.ReLU)
+    return TensorDictModule(critic, ["features", "action"], ["state_action_value"])
+
+
+class Draws:
+    """Normal noise for the whole batch, wherever it is drawn; a rank takes the part that goes with its share."""
+
+    def __init__(self, ranks):
+        self.ranks, self.generator = ranks, torch.Generator().manual_seed(2)
+
+    def __call__(self, like):
+        whole = torch.randn(BATCH, *like.shape[1:], generator=self.generator)
+        return whole.chunk(self.ranks.size)[self.ranks.rank]
 
 
 def batches():
@@ -71,10 +94,14 @@ def update(algorithm, ranks):
     rewards = ReturnNorm(BATCH // ranks.size, gamma=0.9)
     if algorithm == "ddpg":
         loss = PaperDDPGLoss(actor, critic, gamma=0.9, action_l2=0.1)
-        target = JointSoftUpdate(loss, eps=0.9)
+    elif algorithm == "td3":
+        loss = DirectTD3Loss(actor, critic, gamma=0.9, draw=Draws(ranks))
+    elif algorithm == "sac":
+        loss = DirectSACLoss(actor, critic, gamma=0.9, target_entropy=-ACTION, draw=Draws(ranks))
     else:
         coefficients = {"clip": 0.2, "clip_value": True, "critic_coeff": 0.5, "entropy_coeff": 0.01}
         loss = GaussianPPOLoss(actor, critic, **coefficients, add=ranks.sum if ranks.size > 1 else None)
+    target = None if algorithm == "ppo" else JointSoftUpdate(loss, eps=0.9)
     if ranks.rank:
         with torch.no_grad():  # started apart, they must come together
             for parameter in loss.parameters():
@@ -86,12 +113,14 @@ def update(algorithm, ranks):
         norm.module.update(batch["observation"], ranks.sum)
         rewards(batch.unsqueeze(1), add=ranks.sum)
         norm(batch)
-        if algorithm == "ddpg":
-            norm(batch["next"])
-            ddpg.descend(batch, loss, optimiser, ranks)
-            target.step()
-        else:
+        norm(batch["next"])
+        if algorithm == "ppo":
             ppo.descend(batch, loss, optimiser, 0.5, ranks)
+        else:
+            losses = loss(batch)
+            descend([value for name, value in losses.items() if name.startswith("loss")], optimiser, ranks)
+        if target is not None:
+            target.step()
     return [
         *loss.state_dict().values(),
         *norm.state_dict().values(),
@@ -101,6 +130,6 @@ def update(algorithm, ranks):
 
 if __name__ == "__main__":
     ranks = Ranks()
-    for algorithm in ("ddpg", "ppo"):
+    for algorithm in ("ddpg", "ppo", "sac", "td3"):
         torch.save(update(algorithm, ranks), Path(sys.argv[1]) / f"{algorithm}-{ranks.rank}.pt")
     ranks.part()

@@ -113,7 +113,7 @@ def test_an_episode_equals_that_of_the_transform():
 def test_a_vector_equals_the_transform():
     options = {"seed": 3, "max_episode_steps": 15}
     batched = TransformedEnv(
-        make_env("wam_wipe", num_envs=3, **options),
+        make_env("wam_wipe", num_envs=3, seed=0, **options),
         ActionMapTransform(wipe_map(), WIPE_KEYS, action_scale=SCALE),
     )
     vector = gymnasium.make_vec(WIPE, num_envs=3, autoreset_mode=AutoresetMode.SAME_STEP, **options)
@@ -361,7 +361,11 @@ def test_stable_baselines3_ppo_learns_on_two_of_it():
 @pytest.mark.parametrize(
     ("error", "message", "make"),
     [
-        (TypeError, "map must be an nht.ActionMap, got Linear", lambda: (Toy(), torch.nn.Linear(3, 3))),
+        (
+            TypeError,
+            "map must be an nht.ActionMap, or the path of a map's file, got Linear.",
+            lambda: (Toy(), torch.nn.Linear(3, 3)),
+        ),
         (ValueError, "context_keys must name .* context of 3", lambda: (Toy(), NHT(3, 3, 2))),
         (ValueError, "positive, finite number, got -1", lambda: (Toy(), SVD(3, 2), None, -1.0)),
         (

@@ -4,12 +4,22 @@ import re
 
 import pytest
 import torch
-from torchrl.data import Binary, Categorical, Composite, Unbounded
-from torchrl.envs import Compose, ObservationNorm, RenameTransform, SerialEnv, StepCounter, TransformedEnv
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Binary, Categorical, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
+from torchrl.envs import (
+    Compose,
+    MultiAction,
+    ObservationNorm,
+    RenameTransform,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 
 from nht import NHT, SVD, Identity
 from nht.transforms import ActionMapTransform
-from toy_envs import CONTEXT_KEYS, ToyArm, ToyTeam, mapped_arm, nest, toy_map, toy_transform
+from toy_envs import CONTEXT_KEYS, ToyArm, ToyTeam, assert_mapped, mapped_arm, nest, toy_map, toy_transform
 
 
 def trained_on(*keys):
@@ -33,7 +43,7 @@ def test_action_scale_must_be_positive_and_finite(scale):
     [
         (
             TypeError,
-            "map must be an nht.ActionMap, got Linear",
+            "map must be an nht.ActionMap, or the path of a map's file, got Linear.",
             lambda: ActionMapTransform(torch.nn.Linear(2, 3)),
         ),
         (ValueError, "context_keys must name .* context of 5", lambda: ActionMapTransform(toy_map())),
@@ -56,6 +66,12 @@ def test_action_scale_must_be_positive_and_finite(scale):
         (ValueError, "must differ", lambda: toy_transform(context_key="same", executed_key="same")),
         (ValueError, "must differ", lambda: toy_transform(actuation_key="actuation")),
         (FileNotFoundError, "no map file", lambda: ActionMapTransform.from_file("nowhere.safetensors")),
+        (FileNotFoundError, "no map file", lambda: ActionMapTransform("nowhere.safetensors")),
+        (
+            ValueError,
+            "saturation must be one of scale, clip, got 'bend'",
+            lambda: toy_transform(saturation="bend"),
+        ),
     ],
 )
 def test_at_construction(error, message, make):
@@ -147,14 +163,63 @@ def test_two_maps_need_different_keys():
         TransformedEnv(ToyArm(), Compose(toy_transform(), second))
 
 
-@pytest.mark.parametrize("placed", [True, False])
-def test_a_transform_inserted_later_must_not_come_between(placed):
-    first = [ObservationNorm(loc=0.0, scale=1.0, in_keys=["joint"])] if placed else []
-    env = TransformedEnv(ToyArm(), Compose(*first, toy_transform()))
-    env.rollout(2)
-    env.insert_transform(0, ObservationNorm(loc=1.0, scale=2.0, in_keys=["joint"]))
-    with pytest.raises(ValueError, match="ObservationNorm was put in front of the transform that records"):
-        env.reset()
+@pytest.mark.parametrize("width", [1, 3])
+@pytest.mark.parametrize("batched", [False, True], ids=["alone", "in workers"])
+def test_a_policy_of_another_width(width, batched):
+    env = SerialEnv(2, mapped_arm) if batched else mapped_arm()
+    policy = TensorDictModule(torch.nn.Linear(3, width), ["joint"], ["action"])
+    message = rf"NHT takes an action of width 2, got one of shape \({width},\)\."
+    with pytest.raises(ValueError, match=message):
+        env.rollout(3, policy)
+
+
+def recorded(**more):
+    return TensorDict(
+        action=torch.ones(4, 3), tool=torch.ones(4, 2), joint=torch.ones(4, 3), **more, batch_size=4
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "data"),
+    [
+        (toy_transform, recorded()),
+        (toy_transform, recorded(context=torch.ones(4, 5))),
+        (lambda: ActionMapTransform(Identity(3)), recorded(next={"joint": torch.ones(4, 3)})),
+        (lambda: mapped_arm((4,)).transform.clone(), mapped_arm((4,)).rollout(1)[:, 0]),
+    ],
+    ids=["no context", "no policy's action", "transitions", "a clone of an environment's"],
+)
+def test_a_replay_buffer_needs_a_transform_that_goes_forward_only(make, data):
+    buffer = ReplayBuffer(storage=LazyTensorStorage(4))
+    buffer.append_transform(make())
+    with pytest.raises(ValueError, match=r"of a replay buffer, make a transform with forward_only=True\."):
+        buffer.extend(data)
+
+
+def test_without_an_environment_a_chain_maps_a_policys_action():
+    data = TensorDict(action=torch.ones(4, 2), context=torch.ones(4, 5), batch_size=4)
+    mapped = Compose(toy_transform()).inv(data)
+    expected = toy_map()(1.5 * data["action"], data["context"])
+    torch.testing.assert_close(mapped["action"], expected.detach())
+
+
+def test_several_actuations_at_once_have_no_context():
+    with pytest.raises(ValueError, match=r"one context for all of them: put MultiAction behind the Action"):
+        TransformedEnv(ToyArm((2,)), Compose(MultiAction(), toy_transform()))
+
+
+class Odd(Compose):
+    """A Compose that does something else."""
+
+    def _step(self, tensordict, next_tensordict):
+        return super()._step(tensordict, next_tensordict)
+
+
+def test_a_compose_of_ones_own_must_not_hide_the_map_behind_other_transforms():
+    norm = ObservationNorm(loc=0.0, scale=1.0, in_keys=["joint"])
+    with pytest.raises(ValueError, match="in a Compose with a _step or _reset of its own"):
+        TransformedEnv(ToyArm(), Odd(norm, toy_transform()))
+    assert_mapped(TransformedEnv(ToyArm(), Odd(toy_transform(), norm.clone())).rollout(3))
 
 
 def test_a_step_needs_the_context_and_the_action():

@@ -1,5 +1,7 @@
 """ActionMapTransform among other transforms, inside and over batched environments, in collectors, on Gymnasium."""
 
+import copy
+import pickle
 from functools import partial
 
 import gymnasium
@@ -27,7 +29,7 @@ from torchrl.envs import (
 )
 
 from nht import NHT, Identity
-from nht.transforms import ActionMapTransform, ContextSnapshot
+from nht.transforms import ActionMapTransform
 from toy_envs import CONTEXT_KEYS, LIMIT, SCALE, ToyArm, assert_mapped, mapped_arm, toy_map, toy_transform
 
 pytestmark = [
@@ -99,19 +101,57 @@ def test_nested_appended_and_unwrapped(build):
         assert_mapped(data)
 
 
-def test_the_snapshot_comes_first_and_once():
-    env = TransformedEnv(
-        ToyArm(), Compose(StepCounter(), RewardSum(), toy_transform(), StepCounter(step_count_key="late"))
-    )
-    assert [type(transform) for transform in env.transform] == [
-        ContextSnapshot,
-        StepCounter,
-        RewardSum,
-        ActionMapTransform,
-        StepCounter,
-    ]
-    env = TransformedEnv(ToyArm(), Compose(toy_transform(), StepCounter()))
-    assert [type(transform) for transform in env.transform] == [ActionMapTransform, StepCounter]
+def test_the_map_puts_nothing_into_the_chain():
+    """Indices, names and saved states of the other transforms are those that they have without the map."""
+
+    def chain(*last):
+        norm = ObservationNorm(in_keys=["joint"])
+        return Compose(norm, StepCounter(), ObservationNorm(loc=1.0, scale=2.0, in_keys=["tool"]), *last)
+
+    plain = TransformedEnv(ToyArm((3,)), chain())
+    mapped = TransformedEnv(ToyArm((3,)), chain(toy_transform(), StepCounter(step_count_key="late")))
+    assert [type(one) for one in mapped.transform][:3] == [type(one) for one in plain.transform]
+    assert [type(one) for one in mapped.transform][3:] == [ActionMapTransform, StepCounter]
+    for env in (plain, mapped):
+        env.transform[0].init_stats(20, reduce_dim=(0, 1), cat_dim=0)
+    plain.transform[0].loc.fill_(7.0)
+    plain.rollout(5)
+    left = mapped.transform.load_state_dict(plain.transform.state_dict(), strict=False)
+    assert not left.unexpected_keys
+    assert all(key.startswith("transforms.3.") for key in left.missing_keys)
+    assert (mapped.transform[0].loc == 7.0).all()
+    assert_mapped(rollout(mapped))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))])
+def test_copies_of_a_chain_read_the_raw_context_too(copied):
+    env = TransformedEnv(ToyArm((3,)), Compose(OTHERS["ObservationNorm"](), toy_transform()))
+    env.rollout(3)
+    twin = copied(env)
+    for one in (twin, env):
+        assert_mapped(rollout(one))
+        assert one.transform.container is one
+    del env.transform[1]
+    env.empty_cache()
+    assert "context" not in env.rollout(3)
+    assert_mapped(rollout(twin))
+
+
+@pytest.mark.parametrize("first", [[], ["ObservationNorm"]])
+def test_transforms_may_be_inserted_in_front_afterwards(first):
+    env = TransformedEnv(ToyArm((3,)), Compose(*(OTHERS[name]() for name in first), toy_transform()))
+    data = env.rollout(2)
+    env.insert_transform(0, ObservationNorm(loc=1.0, scale=2.0, in_keys=CONTEXT_KEYS))
+    after = env.step(env.rand_action(data[:, -1].clone()))["next"]  # before any spec is asked for
+    env.insert_transform(0, ObservationNorm(loc=1.0, scale=2.0, in_keys=CONTEXT_KEYS))
+    for observed in (after, env.reset()):
+        assert torch.equal(observed["context"], torch.cat([observed["raw", key] for key in CONTEXT_KEYS], -1))
+    assert_mapped(rollout(env))
+    env.append_transform(OTHERS["VecNormV2"]())
+    assert_mapped(rollout(env))
+    alone = mapped_arm((3,))
+    alone.insert_transform(0, OTHERS["CatTensors"]())
+    assert_mapped(rollout(alone))
 
 
 def test_a_context_that_another_transform_makes():

@@ -42,7 +42,7 @@ def minibatch(size: int = 64) -> TensorDict:
     )
 
 
-def networks() -> tuple[GaussianActor, nn.Module]:
+def small_networks() -> tuple[GaussianActor, nn.Module]:
     mean = nn.Sequential(nn.Linear(5, 8), nn.Tanh(), nn.Linear(8, 3))
     return GaussianActor(mean, 3, initial_std=0.7), nn.Sequential(nn.Linear(5, 8), nn.Tanh(), nn.Linear(8, 1))
 
@@ -50,7 +50,7 @@ def networks() -> tuple[GaussianActor, nn.Module]:
 @pytest.mark.parametrize("clip_value", [False, True])
 @pytest.mark.parametrize("entropy_coeff", [0.0, 0.01])
 def test_loss_and_gradients_equal_those_of_torchrl(clip_value, entropy_coeff):
-    actor, critic = networks()
+    actor, critic = small_networks()
     value = TensorDictModule(critic, ["features"], ["state_value"])
     ours = GaussianPPOLoss(
         TensorDictModule(actor, ["features"], ["sample", "sample_log_prob", "action"]),
@@ -100,7 +100,7 @@ def test_loss_and_gradients_equal_those_of_torchrl(clip_value, entropy_coeff):
 
 
 def test_the_actor_is_a_gaussian_whose_actions_are_clipped():
-    actor, _ = networks()
+    actor, _ = small_networks()
     features = torch.randn(100, 5)
     sample, log_prob, action = actor(features)
     normal = torch.distributions.Normal(actor.network(features), actor.log_std.exp())
@@ -158,7 +158,7 @@ def test_advantages_at_the_end_of_an_episode(terminates):
 
 
 def test_what_is_collected_at_a_time_limit_is_the_episodes_own_last_observation():
-    env = make_env("wam_wipe", 2, start="random", max_episode_steps=3)
+    env = make_env("wam_wipe", 2, start="random", max_episode_steps=3, seed=0)
     features, actor, critic = networks(env, PPOConfig(hidden=[8]))
     policy = TensorDictSequential(features, actor)
     collector = Collector(
@@ -207,7 +207,7 @@ def test_rewards_are_divided_by_the_deviation_of_all_discounted_returns():
 
 
 def test_weights_start_orthogonal():
-    env = make_env("wam_wipe")
+    env = make_env("wam_wipe", seed=0)
     _, actor, critic = networks(env, PPOConfig(hidden=[8, 8], activation="relu", initial_std=0.5))
     for network, last_gain in ((actor.module.network, 0.01), (critic.module, 1.0)):
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]

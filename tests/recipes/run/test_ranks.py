@@ -38,7 +38,7 @@ def trained_by_two(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("algorithm", ["ddpg", "ppo"])
+@pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
 def test_two_ranks_with_half_the_batch_equal_one_with_the_whole(trained_by_two, algorithm):
     alone = two_ranks.update(algorithm, Ranks())
     untrained = [
@@ -52,7 +52,7 @@ def test_two_ranks_with_half_the_batch_equal_one_with_the_whole(trained_by_two, 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["ddpg", "ppo"])
+@pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
 def test_a_recipe_with_two_ranks(algorithm, tmp_path):
     process = run(algorithm, tmp_path / "run", "algo.total_frames=400")
     assert process.returncode == 0, process.stderr

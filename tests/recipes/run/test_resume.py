@@ -29,7 +29,7 @@ def train(algorithm: str, folder: Path, *overrides: str) -> pandas.DataFrame:
     return tiny_runs.train(algorithm, folder, *SETTINGS, *overrides)
 
 
-@pytest.fixture(scope="module", params=["ddpg", "ppo"])
+@pytest.fixture(scope="module", params=tiny_runs.RECIPES)
 def whole(request, tmp_path_factory):
     """The algorithm, and a run that nothing stopped: its folder and metrics."""
     folder = tmp_path_factory.mktemp(request.param) / "whole"

@@ -1,0 +1,272 @@
+"""What every action map is: from a low-dimensional action and a context to the actuation of the motors, and back."""
+
+from __future__ import annotations
+
+import functools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any, ClassVar, cast, get_args
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+
+from nht.arguments import named_arguments, positional_arguments, recorded
+from nht.networks import check_choice
+from nht.saturation import DEFAULT_SATURATION, Saturation, saturate
+
+WRAPPED = "_nht_wrapped"
+
+
+class ActionMap(nn.Module, ABC):
+    """A fixed or learned map (action, context) -> actuation, and all that a policy's action means.
+
+    Shapes: action (*batch, k), actuation (*batch, n), context (*batch, context_dim). A map that needs no
+    context takes one all the same; its last dimension may then be 0. Tensors of another last dimension are refused by
+    ``forward`` and ``project``, whatever class overrides them.
+
+    `forward` and `project` are in the map's own, raw units. A policy's action is one in [-1, 1]^k: `decode` makes an
+    actuation of it, `encode` is the way back. What 1 stands for, ``action_scale``, and what happens at the motors'
+    limits, ``saturation``, belong to the map and stand in its file.
+
+    A subclass is trained, saved and loaded like those of this package: what its constructor was given is remembered.
+
+    Attributes:
+        action_dim: k.
+        actuation_dim: n.
+        context_dim: width of the context.
+        context_keys: the entries that, side by side in this order, are the context. None until trained.
+        data_fingerprint: which demonstrations it was trained on. None until trained.
+        action_scale: buffer, scalar: what a policy's 1 stands for. Training sets it to the largest |a_i| of the
+            projected demonstrations, `set_action_scale` to anything else. 1 until then.
+        actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
+        actuation_high: buffer, (n,): the largest ones. infinity until trained.
+        learns: whether demonstrations decide what the map does, not only its bounds.
+        needs_next_context: whether `loss` reads ("next", "context"), (batch, context_dim).
+    """
+
+    learns = True
+    needs_next_context = False
+
+    action_scale: Tensor
+    actuation_low: Tensor
+    actuation_high: Tensor
+    _saturation: Saturation = "clip"  # of objects pickled before there was a choice
+    _recorded_arguments: ClassVar[dict[str, Any]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Lets every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
+        super().__init_subclass__(**kwargs)
+        for name, wrap in (
+            ("__init__", _recording),
+            ("forward", _checked_forward),
+            ("project", _checked_project),
+        ):
+            method = getattr(cls, name)
+            if not getattr(method, "__isabstractmethod__", False) and not hasattr(method, WRAPPED):
+                setattr(cls, name, wrap(method))
+
+    def __init__(self, context_dim: int, actuation_dim: int, action_dim: int) -> None:
+        super().__init__()
+        if not 1 <= action_dim <= actuation_dim:
+            raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}")
+        if context_dim < 0:
+            raise ValueError(f"context_dim must be 0 or more, got {context_dim}")
+        self.context_dim = int(context_dim)
+        self.actuation_dim = int(actuation_dim)
+        self.action_dim = int(action_dim)
+        self.context_keys: tuple[NestedKey, ...] | None = None
+        self.data_fingerprint: str | None = None
+        self.saturation = DEFAULT_SATURATION
+        self.register_buffer("action_scale", torch.ones(()))
+        self.register_buffer("actuation_low", torch.full((self.actuation_dim,), -torch.inf))
+        self.register_buffer("actuation_high", torch.full((self.actuation_dim,), torch.inf))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Lets a subclass have a layer called like one of the methods below, as many autoencoders do.
+
+        `forward` and `project` of the subclass then find the layer, and the method is ``type(map).encode(map, ...)``.
+        """
+        super().__setattr__(name, value)
+        if name in ("decode", "encode", "rest") and isinstance(value, nn.Module | nn.Parameter):
+            self.__dict__[name] = value
+
+    @property
+    def saturation(self) -> Saturation:
+        """What `decode` does at the motors' limits: ``"scale"`` or ``"clip"``, see `nht.saturation`."""
+        return self._saturation
+
+    @saturation.setter
+    def saturation(self, kind: Saturation) -> None:
+        check_choice("saturation", kind, get_args(Saturation))
+        self._saturation = kind
+
+    @abstractmethod
+    def forward(self, action: Tensor, context: Tensor) -> Tensor:
+        """Actuation, (*batch, n), of an action in the map's own units. Nothing is scaled or clipped here.
+
+        Raises:
+            ValueError: if the last dimension of action or context is not the map's.
+        """
+
+    @abstractmethod
+    def project(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """The action, (*batch, k), in the map's own units, that stands for an actuation.
+
+        Raises:
+            ValueError: if the last dimension of actuation or context is not the map's.
+        """
+
+    def decode(
+        self, action: Tensor, context: Tensor, low: Tensor | None = None, high: Tensor | None = None
+    ) -> Tensor:
+        """What a policy's action in [-1, 1]^k does: ``self(action_scale * action, context)``, saturated.
+
+        Args:
+            action: (*batch, k). Entries beyond 1 are taken as they are.
+            context: (*batch, context_dim).
+            low: the smallest actuations that the motors take, (n,) or anything that broadcasts; None, or -infinity,
+                where there is no limit.
+            high: the largest ones, likewise.
+
+        Returns:
+            The actuation, (*batch, n), in the precision of the limits; without limits, in that of the map.
+
+        Raises:
+            ValueError: if the last dimension of action or context is not the map's.
+        """
+        scale = self.action_scale
+        context = context.to(scale.dtype)
+        actuation = self(action.to(scale.dtype) * scale, context)
+        if low is None and high is None:
+            return actuation
+        rest = self.rest(context) if self._saturation == "scale" else None
+        return saturate(actuation, low, high, kind=self._saturation, rest=rest)
+
+    def encode(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """The policy's action that stands for an actuation: ``project(actuation, context) / action_scale``.
+
+        It is not clipped: demonstrations may go beyond [-1, 1]^k.
+
+        Args:
+            actuation: (*batch, n).
+            context: (*batch, context_dim).
+
+        Raises:
+            ValueError: if the last dimension of actuation or context is not the map's.
+        """
+        scale = self.action_scale
+        return self.project(actuation.to(scale.dtype), context.to(scale.dtype)) / scale
+
+    def rest(self, context: Tensor) -> Tensor:
+        """The actuation of no action, from which ``saturation="scale"`` measures, (*batch, n): zero.
+
+        Affine maps have their offset u0(c) here. For a nonlinear map it is zero too, whatever its action 0 gives.
+        """
+        return self.action_scale.new_zeros(*context.shape[:-1], self.actuation_dim)
+
+    @torch.no_grad()
+    def set_action_scale(self, value: float | Tensor) -> None:
+        """Sets what a policy's action of 1 stands for, in the map's own units.
+
+        Raises:
+            ValueError: unless it is a single number, positive and finite, in the map's precision too.
+        """
+        scale = torch.as_tensor(value).detach().to(self.action_scale)
+        if scale.ndim or not 0 < float(scale) < math.inf:
+            given = value.tolist() if isinstance(value, Tensor) else value
+            raise ValueError(f"action_scale must be a positive, finite number, got {given}.")
+        self.action_scale.copy_(scale)
+
+    def loss(self, batch: TensorDictBase) -> Tensor:
+        """What training minimises: the mean of |u - u_hat|^2, u_hat being u projected and mapped back.
+
+        Args:
+            batch: "context" (batch, context_dim) and "actuation" (batch, n); and ("next", "context") for a map
+                that needs it.
+        """
+        actuation, context = batch["actuation"], batch["context"]
+        return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
+
+    def fit(self, batch: TensorDictBase) -> bool:
+        """Prepares the map from all training data, before any gradient step.
+
+        Returns:
+            True if that was all the training it takes: a closed form.
+        """
+        return False
+
+    def init_args(self) -> dict[str, Any]:
+        """The constructor's arguments by name: they make an untrained twin, ``type(map)(**map.init_args())``.
+
+        Of an argument that is kept as an attribute of its own name this is the attribute, else what was given. Only
+        numbers, text, None, lists and dictionaries of these, and other maps can stand in a file. What a constructor
+        takes by position alone, `init_positional` gives.
+        """
+        return named_arguments(self, self._recorded_arguments)
+
+    def init_positional(self) -> tuple[Any, ...]:
+        """The arguments that can be given by position alone; () for a constructor without ``*args`` and ``/``."""
+        return positional_arguments(self, self._recorded_arguments)
+
+    @torch.no_grad()
+    def take_over(self, map: ActionMap) -> None:
+        """What another map learned about its demonstrations, its saturation, precision and device.
+
+        For maps that wrap it.
+        """
+        self.context_keys = map.context_keys
+        self.data_fingerprint = map.data_fingerprint
+        self.saturation = map.saturation
+        self.to(map.action_scale)
+        self.action_scale.copy_(map.action_scale)
+        self.actuation_low.copy_(map.actuation_low)
+        self.actuation_high.copy_(map.actuation_high)
+
+
+def _recording(constructor: Callable[..., None]) -> Callable[..., None]:
+    """A constructor that remembers what the outermost one was given."""
+
+    @functools.wraps(constructor)
+    def __init__(self: ActionMap, *args: Any, **kwargs: Any) -> None:  # noqa: N807 (tracebacks show this name)
+        if "_recorded_arguments" not in self.__dict__:
+            self.__dict__["_recorded_arguments"] = recorded(self, args, kwargs)
+        constructor(self, *args, **kwargs)
+
+    return _marked(cast(FunctionType, __init__))
+
+
+def _checked_forward(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    @functools.wraps(method)
+    def forward(self: ActionMap, action: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        _check_width(self, "an action", action, self.action_dim)
+        _check_width(self, "a context", context, self.context_dim)
+        return method(self, action, context, *args, **kwargs)
+
+    return _marked(cast(FunctionType, forward))
+
+
+def _checked_project(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    @functools.wraps(method)
+    def project(self: ActionMap, actuation: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        _check_width(self, "an actuation", actuation, self.actuation_dim)
+        _check_width(self, "a context", context, self.context_dim)
+        return method(self, actuation, context, *args, **kwargs)
+
+    return _marked(cast(FunctionType, project))
+
+
+def _check_width(map: ActionMap, what: str, given: Tensor, expected: int) -> None:
+    if given.ndim < 1 or given.shape[-1] != expected:
+        raise ValueError(
+            f"{type(map).__name__} takes {what} of width {expected}, got one of shape {tuple(given.shape)}."
+        )
+
+
+def _marked(method: FunctionType) -> Callable[..., Any]:
+    """Lets no subclass wrap it again, and gives it code of its own: compilers count their attempts by that."""
+    method.__code__ = method.__code__.replace()
+    setattr(method, WRAPPED, True)
+    return method

@@ -1,0 +1,100 @@
+"""Action maps that are linear in the action, or affine: u = u0(c) + Q(c) a."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from nht.action_map import ActionMap
+from nht.geometry import least_squares
+from nht.networks import ContextNetwork, check_choice
+from nht.offset import NetworkOffset, Offset
+
+NormKind = Literal["spectral", "frobenius"]
+
+
+class LinearActionMap(ActionMap):
+    """An action map that is linear in the action, u = Q(c) a; or affine, u = u0(c) + Q(c) a.
+
+    Args:
+        context_dim: width of the context.
+        actuation_dim: n.
+        action_dim: k, in 1 ... n.
+        lipschitz: Lipschitz constant that training keeps to, of Q(c) and, apart from it, of u0(c).
+        lipschitz_norm: the norm of the layers' matrices that is limited to this end.
+
+    Attributes:
+        network: what turns the context into a description of the basis; None if the basis is always the same.
+        network_gain: a Lipschitz constant, in the spectral norm, from the network's output to the basis; without
+            a network, from the context to the basis.
+        offset_model: gives u0(c); None for u0 = 0.
+        lipschitz: as given; None for no limit.
+        lipschitz_norm: as given.
+    """
+
+    network: ContextNetwork | None
+    offset_model: Offset | None
+
+    def __init__(
+        self,
+        context_dim: int,
+        actuation_dim: int,
+        action_dim: int,
+        lipschitz: float | None = None,
+        lipschitz_norm: NormKind = "spectral",
+    ) -> None:
+        super().__init__(context_dim, actuation_dim, action_dim)
+        if lipschitz is not None and not 0 < lipschitz < torch.inf:
+            raise ValueError(f"lipschitz must be a positive number or None, got {lipschitz}")
+        check_choice("lipschitz_norm", lipschitz_norm, get_args(NormKind))
+        self.network = None
+        self.network_gain = 0.0
+        self.offset_model = None
+        self.lipschitz = lipschitz
+        self.lipschitz_norm = lipschitz_norm
+
+    @abstractmethod
+    def basis(self, context: Tensor) -> Tensor:
+        """Q(c): (*batch, context_dim) -> (*batch, n, k)."""
+
+    def basis_norm(self) -> float:
+        """A bound on the spectral norm of Q(c), for all contexts; infinity where none is known."""
+        return math.inf
+
+    def forward(self, action: Tensor, context: Tensor) -> Tensor:
+        """u0(c) + Q(c) a."""
+        return self.from_rest((self.basis(context) @ action.unsqueeze(-1)).squeeze(-1), context)
+
+    def project(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """Least squares: the action whose actuation is nearest (Eq. 5), of u - u0(c)."""
+        return least_squares(self.basis(context), self.to_rest(actuation, context))
+
+    def rest(self, context: Tensor) -> Tensor:
+        """u0(c), the actuation of no action, (*batch, n)."""
+        return super().rest(context) if self.offset_model is None else self.offset_model(context)
+
+    def from_rest(self, way: Tensor, context: Tensor) -> Tensor:
+        """u0(c) plus a way (*batch, n): the actuation."""
+        return way if self.offset_model is None else self.offset_model(context) + way
+
+    def to_rest(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """An actuation (*batch, n) less u0(c): its way from rest."""
+        return actuation if self.offset_model is None else actuation - self.offset_model(context)
+
+    def offset_loss(self, way: Tensor) -> Tensor | float:
+        """What a contextual u0 is trained by, beside the loss: |u - u0(c)|^2, in its gradient but not in its value.
+
+        The loss asks nothing of u0 within the span of Q(c), where an action does as much. Whatever Q(c) is, the mean of
+        the actuations, given the context, is a best u0 outside the span; within, it makes 0 the mean action.
+
+        Args:
+            way: u - u0(c), (batch, n).
+        """
+        if not isinstance(self.offset_model, NetworkOffset):
+            return 0.0
+        pull = way.square().sum(-1).mean()
+        return pull - pull.detach()

@@ -1,0 +1,83 @@
+"""SAC through an action map (Haarnoja et al. 2018, with a learned temperature).
+
+python -m nht.recipes.sac env=half_cheetah map=none seed=0
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictSequential
+
+from nht.recipes.agents.off_policy import JointSoftUpdate, descend, minibatches, replay_buffer, storable
+from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
+from nht.recipes.agents.sac import SAC, DirectSACLoss, networks
+from nht.recipes.launch import launch
+from nht.recipes.run.environments import RunEnvs
+from nht.recipes.run.evaluation import evaluate
+from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.loop import Loop
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.record import Record
+
+
+def main(config: SAC) -> None:
+    """Train, evaluate on the way, and say at the end what happened."""
+    algo = config.algo
+    ranks = Ranks(config.device, seed=config.seed, threads=config.torch_threads)
+    folder = RunFolder(config, ranks)
+    if folder.whole:
+        return folder.show()
+    envs = RunEnvs(folder.config, folder.map, ranks)
+    record = Record(folder, ranks, envs, losses=DirectSACLoss.reports)
+
+    features, actor, critic = networks(envs.train, algo)
+    policy = TensorDictSequential(features, actor)
+
+    rewards = reward_range(envs.train)
+    action_dim = envs.train.action_spec.shape[-1]
+    loss = DirectSACLoss(
+        actor,
+        critic,
+        gamma=algo.gamma,
+        target_entropy=-action_dim if algo.target_entropy is None else algo.target_entropy,
+        initial_temperature=algo.initial_temperature,
+    )
+    target = JointSoftUpdate(loss, eps=algo.polyak)
+    look_ahead = n_step_returns(algo.gamma, algo.n_steps)
+    optimiser = torch.optim.Adam(
+        [
+            {"params": list(loss.actor_network_params.values(True, True)), "lr": algo.actor_learning_rate},
+            {"params": list(loss.qvalue_network_params.values(True, True)), "lr": algo.critic_learning_rate},
+            {"params": [loss.log_alpha], "lr": algo.temperature_learning_rate},
+        ],
+        fused=True,
+    )
+    buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
+    batch_size = ranks.share("algo.batch_size", algo.batch_size)
+    parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
+    loop = Loop(folder, ranks, envs, record, policy, loss, random_frames=algo.random_frames, **parts)
+
+    with loop.batches() as batches:
+        for data in batches:  # (copies, steps)
+            record.count_steps(data)
+            features.module.update(data["observation"], ranks.sum)
+            buffer.extend(storable(look_ahead(charge_failure(data, algo.gamma, rewards))))
+
+            if record.frames >= algo.warmup_frames:
+                for batch in minibatches(buffer, algo.updates_per_batch, batch_size, features, ranks.device):
+                    losses = loss(batch)
+                    descend(
+                        [losses["loss_actor"], losses["loss_qvalue"], losses["loss_alpha"]],
+                        optimiser,
+                        ranks,
+                    )
+                    target.step()
+                    record.count_update(losses)
+
+            if record.evaluation_due:
+                record.log(evaluate(envs.test, policy))
+    loop.finish(policy)
+
+
+if __name__ == "__main__":
+    launch(main, SAC, "sac")

@@ -1,0 +1,135 @@
+"""Learning curves of runs: read from their folders, grouped by what belongs together, as tables and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # no display is needed
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas
+
+from nht.recipes.run.config_file import read_settings
+from nht.recipes.run.folder import CONFIG_FILE, METRICS_FILE, OLDEST_ALGORITHM
+from nht.recipes.run.metrics import FAILURE, FRAMES, SECONDS, SUCCESS, tested
+from nht.recipes.run.metrics_file import metrics_table
+from nht.recipes.study.figures import colour
+from nht.recipes.study.scores import interquartile_mean, interval
+
+LABELS = ("task", "algorithm", "interface", "seed")
+"""Columns that say whose an evaluation is."""
+
+
+def read_runs(folders: list[Path]) -> pandas.DataFrame:
+    """The evaluations of all runs in or below ``folders``, a row each, with ``LABELS``.
+
+    An interface is named with its number of actions where runs of several are there. Nothing that a run's
+    configuration names is imported.
+
+    Raises:
+        FileNotFoundError: if there is no run with an evaluation.
+        ValueError: if a run's files cannot be read.
+    """
+    metrics = sorted({path for folder in folders for path in folder.rglob(METRICS_FILE)})
+    if not metrics:
+        raise FileNotFoundError(f"no {METRICS_FILE} in or below {[str(folder) for folder in folders]}.")
+    curves = pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
+    if curves.empty:
+        raise FileNotFoundError(
+            f"no run in or below {[str(folder) for folder in folders]} has an evaluation yet."
+        )
+    widths = curves.groupby(["task", "interface"])["action_dim"].transform("nunique")
+    named = curves["interface"] + " (k = " + curves["action_dim"].astype(str) + ")"
+    return curves.assign(interface=curves["interface"].where(widths == 1, named)).drop(columns="action_dim")
+
+
+def _read_run(metrics: Path) -> pandas.DataFrame:
+    settings = read_settings(metrics.with_name(CONFIG_FILE))
+    env, map = settings.get("env", {}), settings.get("map", {})
+    rows = metrics_table(metrics)
+    kind = map.get("kind", "nht")
+    labels = {
+        "task": env.get("name", "unknown"),
+        "algorithm": str(settings.get("recipe", OLDEST_ALGORITHM)).lower(),
+        "interface": "raw" if kind == "none" else kind,
+        "seed": settings.get("seed", 0),
+        "action_dim": map.get("action_dim", 0),
+    }
+    for place, (name, value) in enumerate(labels.items()):
+        rows.insert(place, name, value)
+    return rows
+
+
+def groups(curves: pandas.DataFrame, lines: str) -> Iterator[tuple[str, pandas.DataFrame]]:
+    """What belongs in one table and one figure, by a name for its files: one task and algorithm, or task and interface.
+
+    Args:
+        curves: as ``read_runs`` gives them.
+        lines: what is compared within a group, ``"interface"`` or ``"algorithm"``.
+    """
+    other = "algorithm" if lines == "interface" else "interface"
+    for (task, same), group in curves.groupby(["task", other], sort=False):
+        yield f"{task}-{same}", group
+
+
+def summarise(curves: pandas.DataFrame, metric: str = SUCCESS, lines: str = "interface") -> pandas.DataFrame:
+    """Per interface, or algorithm: seeds, steps, mean and interquartile mean over seeds of the last evaluation of all.
+
+    For success also the failures, and the median of the steps to a success of 0.9.
+    """
+    rows = []
+    shown = "{:.3f}" if metric == SUCCESS else "{:,.0f}"
+    for name, group in curves.groupby(lines, sort=False):
+        together = reached_by_all(group)
+        last = together[together[FRAMES] == together[FRAMES].max()]
+        scores = last[tested(metric)].to_numpy()
+        seeds = group["seed"].nunique()
+        row = {
+            lines: name,
+            "seeds": seeds,
+            "steps": int(together[FRAMES].max()),
+            metric: shown.format(scores.mean()),
+            "95 %": " .. ".join(map(shown.format, interval(scores))),
+            "IQM": shown.format(interquartile_mean(scores)),
+            "95 % of it": " .. ".join(map(shown.format, interval(scores, interquartile_mean))),
+        }
+        if metric == SUCCESS:
+            reached = group[group[tested(SUCCESS)] >= 0.9].groupby("seed")[FRAMES].min()
+            row["failure"] = f"{last[tested(FAILURE)].mean():.3f}"
+            all_there = len(reached) == seeds
+            row["steps to 0.9"] = (
+                f"{int(reached.median()):,}" if all_there else f"{len(reached)} of {seeds} seeds"
+            )
+        rows.append(row | {"minutes": f"{last[SECONDS].mean() / 60:.1f}"})
+    return pandas.DataFrame(rows)
+
+
+def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
+    """The evaluations of one interface that every one of its seeds has made: some runs may have gone on for longer."""
+    seeds = group.groupby(FRAMES)["seed"].transform("nunique")
+    return group[seeds == group["seed"].nunique()]
+
+
+def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path, lines: str = "interface") -> None:
+    """Mean over the seeds of every interface, or algorithm, with its interval, against environment steps."""
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for name, group in curves.groupby(lines, sort=False):
+        by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]
+        frames = np.array(list(by_frames.groups))
+        bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
+        seeds = group["seed"].nunique()
+        label = f"{name} ({seeds} seed{'s' if seeds > 1 else ''})"
+        (line,) = axes.plot(frames, by_frames.mean(), label=label, color=colour(str(name).partition(" (")[0]))
+        axes.fill_between(frames, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.2, linewidth=0)
+    axes.set(xlabel="environment steps", ylabel=f"{metric} of test episodes", title=title)
+    if metric == SUCCESS:
+        axes.set(ylim=(-0.03, 1.03))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best")
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,1 @@
+"""A task, a map and an algorithm of one's own."""
