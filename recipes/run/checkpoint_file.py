@@ -247,7 +247,9 @@ class CheckpointFile:
                 continue
             values = self._tensor(f"{name}.memmap", record, where)
             if not 0 <= length <= (len(values) if values.ndim else 0):
-                raise ValueError(f"{where} has the shape {list(values.shape)}, of which {length} rows are filled.")
+                raise ValueError(
+                    f"{where} has the shape {list(values.shape)}, of which {length} rows are filled."
+                )
             rows[key] = values[:length]
         return rows
 

@@ -43,7 +43,8 @@ def test_many_changes(kind, folder):
 
 def main(tries: int) -> None:
     """Print what became of the changes, by kind of file."""
-    print("| kind of file | tried | clear | equal meaning | another that is possible | other |\n|---|---|---|---|---|---|")
+    print("| kind of file | tried | clear | equal meaning | another that is possible | other |")
+    print("|---|---|---|---|---|---|")
     for kind in KINDS:
         with tempfile.TemporaryDirectory() as folder:
             os.environ["MINARI_DATASETS_PATH"] = folder

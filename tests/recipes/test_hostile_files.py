@@ -624,6 +624,10 @@ def other_value(members: dict[str, bytes], outside: Path) -> None:
     members[name] = members[name].replace(b'"dict"', b'"object"')
 
 
+IGNORED = (pickled_queue, with_torch_file, pickled_value)
+"""By a reader that knows no checksums and does not look at them."""
+
+
 @pytest.mark.parametrize(
     "attack",
     [pickled_queue, with_torch_file, pickled_value, cut_member, member_outside, member_at_root, other_value],
@@ -636,13 +640,12 @@ def test_a_hostile_checkpoint(attack, checkpoint, outside):
             file.check()
             file.read()
 
-    harmless = (pickled_queue, with_torch_file, pickled_value)  # to a reader that does not look at them
     with only_reads(outside):
-        try:
+        if attack in IGNORED:
             read()
-            assert attack in harmless
-        except ValueError as error:
-            assert str(checkpoint) in str(error)
+        else:
+            with pytest.raises(ValueError, match=checkpoint.name):
+                read()
     assert not (outside / "exploded").exists()
 
 
@@ -685,9 +688,12 @@ def a_link(file: Path) -> None:
 def test_a_hostile_archive(attack, message, checkpoint):
     attack(checkpoint)
     checkpoints, _ = fresh(checkpoint)
-    with only_reads(checkpoint.parents[1]), pytest.warns(UserWarning, match=message):
-        with pytest.raises(ValueError, match="none of the checkpoints in .* can be read"):
-            checkpoints.steps()
+    with (
+        only_reads(checkpoint.parents[1]),
+        pytest.warns(UserWarning, match=message),
+        pytest.raises(ValueError, match=r"none of the checkpoints in .* can be read"),
+    ):
+        checkpoints.steps()
 
 
 # Policies and configurations.
@@ -722,17 +728,28 @@ def test_a_hostile_policy(tmp_path):
     assert torch.equal(read_policy(file, expected)["bias"], expected["bias"])
 
 
+LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n"
+    for before, name in zip("abcdef", "bcdefg", strict=True)
+)
+"""Nine times nine times ... the same."""
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("recipe: !!python/object/apply:os.system ['touch {outside}/ran']", "is not YAML that can be read"),
-        ("recipe: hostile_module:ALGORITHM", r"names recipe=hostile_module:ALGORITHM, code that would be run"),
-        ("env: {name: 'hostile_module:explode'}", r"names env.name=hostile_module:explode.*allow=\[hostile_module\]"),
+        (
+            "recipe: hostile_module:ALGORITHM",
+            r"names recipe=hostile_module:ALGORITHM, code that would be run",
+        ),
+        (
+            "env: {name: 'hostile_module:explode'}",
+            r"names env.name=hostile_module:explode.*allow=\[hostile_module\]",
+        ),
         ("map: {kind: 'hostile_module:explode'}", r"names map.kind=hostile_module:explode"),
         ("device: ${oc.env:HOME}", r"is not looked up"),
-        ("a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
-            f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n" for before, name in zip("abcdef", "bcdefg", strict=True)
-        ), r"more than 20,000 values"),
+        (LAUGHS, r"more than 20,000 values"),
         ("- a list", "holds a list, expected settings by name"),
         ("seed: 2020-01-01", "holds a date"),
         ("recipe: nonsense", r"unknown algorithm 'nonsense'"),
@@ -740,7 +757,7 @@ def test_a_hostile_policy(tmp_path):
         ("elbow: 1", "is no configuration of a run: .*elbow"),
         ("\x00", "is not YAML"),
     ],
-)  # fmt: skip
+)
 def test_a_hostile_configuration(text, message, outside, hostile_module, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

@@ -5,7 +5,7 @@ import random
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,19 @@ import toy_search
 from mutations import mutated
 from nht.memmap import read_tensordict
 from nht.recipes.agents.policy_file import read_policy, write_policy
+from nht.recipes.agents.ppo import PPO
+from nht.recipes.data.files import read_episodes
+from nht.recipes.launch import configure
 from nht.recipes.run.checkpoint_file import CheckpointFile
 from nht.recipes.run.checkpoints import Checkpoints
 from nht.recipes.run.folder import read_config
 from nht.recipes.run.metrics_file import read_metrics
 from nht.recipes.run.statistics import Counters
+from nht.recipes.sections import SourceConfig
 from nht.recipes.study.jobs import Ending
 from nht.recipes.study.results import read_results
 from nht.recipes.study.space import read_manifest, write_manifest
-from toy_demos import demonstrations, episodes, write_hdf5
+from toy_demos import as_rollout, demonstrations, episodes, write_hdf5
 from untouched import only_reads
 
 
@@ -51,7 +55,10 @@ class Kind:
 def meaning(value: Any) -> Any:
     """Nested values in a form that can be compared."""
     if isinstance(value, TensorDictBase):
-        return {"/".join(key) if isinstance(key, tuple) else key: meaning(one) for key, one in value.items(True, True)}
+        return {
+            "/".join(key) if isinstance(key, tuple) else key: meaning(one)
+            for key, one in value.items(True, True)
+        }
     if isinstance(value, (torch.Tensor, np.ndarray)):
         array = np.ascontiguousarray(value.detach().numpy() if isinstance(value, torch.Tensor) else value)
         return str(array.dtype), array.shape, hashlib.sha256(array.tobytes()).hexdigest()
@@ -71,7 +78,12 @@ def make_map(folder: Path) -> list[Path]:
 
 def read_map(folder: Path) -> Any:
     map = nht.load_map(folder / "map.safetensors")
-    return type(map).__name__, meaning(dict(map.state_dict())), meaning(map.init_args()), repr(map.context_keys)
+    return (
+        type(map).__name__,
+        meaning(dict(map.state_dict())),
+        meaning(map.init_args()),
+        repr(map.context_keys),
+    )
 
 
 def make_policy(folder: Path) -> list[Path]:
@@ -88,7 +100,9 @@ def parts_of_a_run(rows: int) -> dict[str, Any]:
     torch.manual_seed(0)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
     if rows:
-        buffer.extend(TensorDict({"a": torch.randn(rows, 2), "next": {"b": torch.randn(rows)}}, batch_size=rows))
+        buffer.extend(
+            TensorDict({"a": torch.randn(rows, 2), "next": {"b": torch.randn(rows)}}, batch_size=rows)
+        )
     return {"loss": torch.nn.Linear(3, 2), "counters": Counters(100, 7), "buffer": buffer}
 
 
@@ -125,9 +139,14 @@ def read_demos(folder: Path) -> Any:
 
 
 def make_tensordict(folder: Path) -> list[Path]:
-    episodes().memmap(folder / "data")
+    as_rollout(episodes()).memmap(folder / "data")
     files = sorted(path for path in (folder / "data").rglob("*") if path.is_file())
     return files + 5 * [file for file in files if file.name == "meta.json"]
+
+
+def read_folder(folder: Path) -> Any:
+    found = read_episodes(SourceConfig(kind="tensordict", path=str(folder / "data")))
+    return meaning(read_tensordict(folder / "data")), meaning(found.data), found.left_out
 
 
 def make_minari(folder: Path) -> Path:
@@ -151,11 +170,6 @@ def read_minari(folder: Path) -> Any:
 
 
 def make_config(folder: Path) -> list[Path]:
-    from nht.recipes.config import PPO
-    from nht.recipes.launch import configure
-
-    from dataclasses import asdict
-
     config = asdict(configure(PPO, "ppo", ["env=wam_wipe", "map=nht", "run.wandb=false"]))
     (folder / "config.yaml").write_text(yaml.safe_dump({"recipe": "ppo", **config}, sort_keys=False))
     return [folder / "config.yaml"]
@@ -163,7 +177,9 @@ def make_config(folder: Path) -> list[Path]:
 
 def make_metrics(folder: Path) -> list[Path]:
     heading = "frames,train_success,eval_success,eval_failure,eval_return,updates,seconds\r\n"
-    rows = "".join(f"{300 * n},,0.{n},0.0,-2{n}.5,{15 * n},{n}.25\r\n".replace(",,", ",nan,") for n in range(1, 5))
+    rows = "".join(
+        f"{300 * n},,0.{n},0.0,-2{n}.5,{15 * n},{n}.25\r\n".replace(",,", ",nan,") for n in range(1, 5)
+    )
     (folder / "metrics.csv").write_bytes((heading + rows).encode())
     return [folder / "metrics.csv"]
 
@@ -185,7 +201,9 @@ def make_outcome(folder: Path) -> list[Path]:
 
 
 def make_manifest(folder: Path) -> list[Path]:
-    write_manifest(folder / "manifest.json", {"configs": 3, "seeds": 2, "space": {"agent": {"a": [0.1, 1.0]}}})
+    write_manifest(
+        folder / "manifest.json", {"configs": 3, "seeds": 2, "space": {"agent": {"a": [0.1, 1.0]}}}
+    )
     return [folder / "manifest.json"]
 
 
@@ -199,7 +217,7 @@ KINDS: dict[str, Kind] = {
     "checkpoint": Kind(make_checkpoint, read_checkpoint),
     "demonstrations: manifest.json": Kind(make_demos_manifest, read_demos),
     "demonstrations: data": Kind(make_demos_data, read_demos),
-    "TensorDict folder": Kind(make_tensordict, lambda folder: meaning(read_tensordict(folder / "data")), sealed=False),
+    "TensorDict folder": Kind(make_tensordict, read_folder, sealed=False),
     "Minari metadata.json": Kind(make_minari_metadata, read_minari, sealed=False),
     "Minari main_data.hdf5": Kind(make_minari_data, read_minari, sealed=False),
     "HDF5": Kind(make_hdf5, lambda folder: meaning(nht.from_hdf5(folder / "toy.hdf5").data), sealed=False),
