@@ -44,6 +44,8 @@ def read_metrics(file: Path) -> tuple[list[str], list[list[str]]]:
 def metrics_table(file: Path) -> pandas.DataFrame:
     """The same as numbers, a column for each name of the heading."""
     heading, rows = read_metrics(file)
+    if not rows:
+        return pandas.DataFrame(columns=heading)
     table = pandas.DataFrame(rows, columns=heading).astype(float)
     return table.astype({FRAMES: int})
 
