@@ -6,6 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+LISTED = 30  # keys that a message names
 FLAGS = ("terminated", "truncated", "done", "success")
 # TorchRL's data sets and its collectors number their episodes, and mark as false the padding of split ones.
 EPISODE_KEYS: tuple[NestedKey, ...] = ("episode", ("collector", "traj_ids"))
@@ -216,5 +217,7 @@ def key_name(key: NestedKey) -> str:
 
 
 def listed(data: TensorDictBase) -> str:
-    """All keys, for messages."""
-    return ", ".join(repr(key) for key, _ in items(data))
+    """The keys, for messages; of many the first ones."""
+    names = [repr(key) for key, _ in items(data)]
+    more = f" and {len(names) - LISTED:,} more" if len(names) > LISTED else ""
+    return ", ".join(names[:LISTED]) + more

@@ -12,7 +12,7 @@ from nht.arrays import as_tensor
 from nht.demos import Demos
 from nht.episodes import whole_episodes
 from nht.hdf5_file import import_h5py, names, opened, read
-from nht.reading import shown
+from nht.reading import naming, shown
 
 D4RL_CONTEXT: Mapping[str, str] = MappingProxyType({"observation": "observations"})
 OUTCOMES = {"reward": "rewards", "terminated": "terminals", "truncated": "timeouts"}  # ours: D4RL's, optional
@@ -57,7 +57,8 @@ def from_hdf5(
     data, left_out = hdf5_episodes(
         path, actuation_key=actuation_key, context=context, episode_key=episode_key, done_key=done_key
     )
-    return Demos.from_episodes(data, env=env, settings={"left_out_episodes": left_out})
+    with naming(path):
+        return Demos.from_episodes(data, env=env, settings={"left_out_episodes": left_out})
 
 
 def hdf5_episodes(
@@ -75,13 +76,15 @@ def hdf5_episodes(
     needed |= {(name,): key for name, key in (("number", episode_key), ("end", done_key)) if key is not None}
     optional: dict[tuple[str, ...], str] = {("next", name): key for name, key in OUTCOMES.items()}
     optional |= {("next", "context", name): f"next_{key}" for name, key in sources.items()}
-    return whole_episodes(
-        _read(Path(path), needed, optional),
-        actuation_key="actuation",
-        context={tuple(name.split("/")): ("context", name) for name in sources},
-        episode_key=None if episode_key is None else "number",
-        done_key=None if done_key is None else "end",
-    )
+    data = _read(Path(path), needed, optional)
+    with naming(path):
+        return whole_episodes(
+            data,
+            actuation_key="actuation",
+            context={tuple(name.split("/")): ("context", name) for name in sources},
+            episode_key=None if episode_key is None else "number",
+            done_key=None if done_key is None else "end",
+        )
 
 
 def _read(path: Path, needed: dict[tuple[str, ...], str], optional: dict[tuple[str, ...], str]) -> TensorDict:

@@ -25,7 +25,7 @@ from nht.minari_file import (
     leaves_that_are_no_arrays,
     local_datasets,
 )
-from nht.reading import shortened, shown
+from nht.reading import naming, shortened, shown
 from nht.scratch import check_room, publish, scratch
 
 if TYPE_CHECKING:
@@ -77,16 +77,14 @@ def from_minari(
     if env is not None and found != env:
         raise ValueError(f"{opened.id} holds demonstrations of env {found!r}, expected {env!r}")
     data, left_out = minari_episodes(opened, context)
-    return Demos.from_episodes(
-        data,
-        env=found,
-        expert=opened.storage.metadata.get("algorithm_name", "unknown"),
-        settings={
-            "minari_dataset": opened.id,
-            "left_out_episodes": left_out,
-            **left_out_observations(opened, context),
-        },
-    )
+    notes = left_out_observations(opened, context)
+    with naming(opened.storage.data_path):
+        return Demos.from_episodes(
+            data,
+            env=found,
+            expert=opened.storage.metadata.get("algorithm_name", "unknown"),
+            settings={"minari_dataset": opened.id, "left_out_episodes": left_out, **notes},
+        )
 
 
 def left_out_observations(dataset: MinariDataset, context: Any) -> dict[str, list[str]]:
@@ -126,26 +124,36 @@ def minari_episodes(
 ) -> tuple[TensorDict, int]:
     """What `from_minari` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
     targets = context if context is None or isinstance(context, Mapping) else {name: name for name in context}
-    parts, lengths = [], []
-    for episode in _episodes(dataset):
-        moments = _moments(dataset, episode)
-        if targets is None:
-            targets = {name: name for name in moments if not name.startswith("infos/")}
-        if missing := set(targets.values()) - moments.keys():
-            raise KeyError(
-                f"entries {sorted(missing)} are not in episode {episode.id} of {dataset.id}, which has {shown(moments)}"
-            )
-        parts.append(_transitions(episode, moments, set(targets.values())))
-        lengths.append(len(episode))
-    if targets is None or not sum(lengths):
-        raise ValueError(f"the Minari dataset {dataset.id} has no transitions")
+    with naming(dataset.storage.data_path):
+        parts, lengths = [], []
+        for episode in _episodes(dataset):
+            moments = _moments(dataset, episode)
+            if targets is None:
+                targets = {name: name for name in moments if not name.startswith("infos/")}
+            if missing := set(targets.values()) - moments.keys():
+                raise KeyError(
+                    f"entries {sorted(missing)} are not in episode {episode.id} of {dataset.id}, which has "
+                    f"{shown(moments)}"
+                )
+            parts.append(_transitions(episode, moments, set(targets.values())))
+            lengths.append(len(episode))
+        if targets is None or not sum(lengths):
+            raise ValueError(f"the Minari dataset {dataset.id} has no transitions")
+        return whole_episodes(
+            _joined(dataset.id, parts, lengths),
+            context={tuple(name.split("/")): ("context", key) for name, key in targets.items()},
+        )
+
+
+def _joined(name: str, parts: list[dict[tuple[str, ...], Array]], lengths: list[int]) -> TensorDict:
+    """The rows of all episodes one after another, with the number of each one's episode."""
+    if differing := {key for part in parts for key in part.keys() ^ parts[0].keys()}:
+        entries = sorted("/".join(key) for key in differing)
+        raise ValueError(f"some episodes of {name} have the entries {shown(entries)}, others lack them")
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    rows = {key: as_tensor(column, f"{dataset.id}, {'/'.join(key)}") for key, column in columns.items()}
-    data = TensorDict(rows, [sum(lengths)])
-    data["episode"] = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
-    return whole_episodes(
-        data, context={tuple(name.split("/")): ("context", key) for name, key in targets.items()}
-    )
+    rows = {key: as_tensor(column, f"{name}, {'/'.join(key)}") for key, column in columns.items()}
+    rows["episode",] = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
+    return TensorDict(rows, [sum(lengths)])
 
 
 def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:

@@ -68,6 +68,10 @@ def check_dataset(folder: Path) -> None:
     data = plain_file(folder / DATA)
     with opened(data) as handle:
         check_file(handle)
+        if about["total_episodes"] > len(handle):
+            raise ValueError(
+                f"{file} says {about['total_episodes']:,} episodes, {data.name} has {len(handle):,}: it was cut short."
+            )
         if about.get("jpeg_encoding", True):
             for episode in range(about["total_episodes"]):
                 for name, space in spaces.items():

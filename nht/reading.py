@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,20 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         raise ValueError("an object has the same name twice")
     return found
+
+
+@contextmanager
+def naming(file: object) -> Iterator[None]:
+    """Within, errors about what a file holds name it; what torch says of odd shapes becomes a ValueError."""
+    try:
+        yield
+    except (ValueError, KeyError) as error:
+        text = str(error.args[0]) if error.args else ""
+        if type(error) not in (ValueError, KeyError) or str(file) in text:
+            raise
+        raise type(error)(f"{file}: {text}") from error
+    except (RuntimeError, IndexError, TypeError) as error:
+        raise ValueError(f"{file} holds arrays that do not go together: {shortened(error)}.") from error
 
 
 def entry(record: Mapping[str, Any], name: str, kind: type | tuple[type, ...], where: str) -> Any:

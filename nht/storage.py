@@ -169,6 +169,8 @@ def _loaded(path: Path, allow: Sequence[str]) -> ActionMap:
     found = header.get("format_version")
     if found not in ("1", str(FORMAT_VERSION)):
         raise ValueError(f"has format version {found}, this version of nht reads 1 and {FORMAT_VERSION}.")
+    if found == "1" and "checksum" in header:
+        raise ValueError("was changed: it says format version 1, which has no checksum, and has one.")
     text = header["map"]
     if found != "1" and header.get("checksum") != _checksum(text, tensors):
         raise ValueError("has been changed since it was written: its checksum does not fit.")

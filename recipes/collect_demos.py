@@ -18,6 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import nht
 from nht.envs import make_env
+from nht.reading import naming
 from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import CollectDemos
 from nht.recipes.data.files import FILES, best_episodes, read_episodes
@@ -121,7 +122,8 @@ def import_demos(
         data, worse = best_episodes(data, min_return)
         left_out += worse
     settings = {"source": asdict(source), "min_return": min_return, "left_out_episodes": left_out, **notes}
-    demos = nht.Demos.from_episodes(data, env=env.name, expert=expert, settings=settings)
+    with naming(source.path):
+        demos = nht.Demos.from_episodes(data, env=env.name, expert=expert, settings=settings)
     check_fits(demos, env, source.path or "")
     return nht.save_demos(demos.data, path, env=env.name, seed=None, expert=expert, settings=settings)
 

@@ -5,7 +5,6 @@ python -m nht.recipes.search search=wam search.configs=128 search.seeds=5
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -146,10 +145,7 @@ def record_demos(config: Search, folder: Path, demos: Path) -> None:
     while not demos.exists():
         with claimed(folder / "claims" / "demos") as ours:
             if ours and not demos.exists():
-                scratch = folder / f".demos-{os.getpid()}"
-                shutil.rmtree(scratch, ignore_errors=True)
-                record_expert(task_env(config.search), config.demos, config.search.seed, scratch)
-                scratch.rename(demos)
+                record_expert(task_env(config.search), config.demos, config.search.seed, demos)
         time.sleep(0 if demos.exists() else POLL)
 
 

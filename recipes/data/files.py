@@ -12,6 +12,7 @@ from nht.episodes import whole_episodes
 from nht.hdf5 import D4RL_CONTEXT, hdf5_episodes
 from nht.memmap import read_tensordict
 from nht.minari import left_out_observations, minari_episodes, open_minari
+from nht.reading import naming
 from nht.recipes.sections import SourceConfig
 
 
@@ -47,7 +48,9 @@ def read_episodes(source: SourceConfig) -> Episodes:
     context = source.context or {"observation": "observation"}
     names = {name: _nested(key) for name, key in context.items()}
     nested = {name: _nested(key) for name, key in given.items()}
-    return Episodes(*whole_episodes(load_tensordict(source.path), context=names, **nested))
+    data = load_tensordict(source.path)
+    with naming(source.path):
+        return Episodes(*whole_episodes(data, context=names, **nested))
 
 
 FILES = {

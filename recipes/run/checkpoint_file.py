@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tempfile
 import uuid
 import zipfile
 from collections.abc import Mapping
@@ -24,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nht.memmap import DTYPES, PLAIN, raw, read_tensordict
+from nht.memmap import DTYPES, META, PLAIN, STORAGE, file_name, raw
 from nht.reading import MAX_TEXT, checksum, entry, parse_json, plain_file, shortened
 from nht.recipes.run.state_json import decoded, encoded
 
@@ -224,24 +223,35 @@ class CheckpointFile:
 
     def _dumped_buffer(self, folder: str) -> dict[str, Any]:
         """A replay buffer as TorchRL's ``dump`` left it, less what it pickles: a queue that is empty here."""
-        inner = f"{folder}/storage/"
-        with tempfile.TemporaryDirectory(prefix="nht-checkpoint-") as scratch:
-            for name in self._members:
-                if name.startswith(inner):
-                    place = Path(scratch, *PurePosixPath(name[len(inner) :]).parts)
-                    place.parent.mkdir(parents=True, exist_ok=True)
-                    with place.open("wb") as output:
-                        self._read(name, output=output)
-            rows = read_tensordict(scratch).clone().to_dict()
-        writer = self._json(f"{folder}/writer/metadata.json")
         where = f"{self.file}, {folder}"
-        return {
-            "rows": rows,
-            "writer": {
-                "_cursor": entry(writer, "cursor", int, where),
-                "_write_count": entry(writer, "write_count", int, where),
-            },
-        }
+        storage = self._json(f"{folder}/storage/{STORAGE}")
+        if entry(storage, "is_pytree", bool, where):
+            raise ValueError(f"{where} is of nested tuples or lists, expected a TensorDict.")
+        rows = self._rows(f"{folder}/storage", entry(storage, "len", int, where))
+        writer = self._json(f"{folder}/writer/metadata.json")
+        names = ("cursor", "write_count")
+        return {"rows": rows, "writer": {f"_{name}": entry(writer, name, int, where) for name in names}}
+
+    def _rows(self, folder: str, length: int) -> dict[str, Any]:
+        """The first rows of a TensorDict as it lays itself out in raw files."""
+        about = self._json(f"{folder}/{META}")
+        if about.get("_type") != PLAIN:
+            raise ValueError(f"{self.file}, {folder}/{META} is of another type than TensorDict.")
+        rows: dict[str, Any] = {}
+        for key, record in about.items():
+            name, where = f"{folder}/{file_name(key)}", f"{self.file}, {folder}, {shortened(key, 60)!r}"
+            if not isinstance(record, dict):
+                continue  # shape, device and type of the whole
+            if "type" in record:
+                rows[key] = self._rows(name, length)
+                continue
+            values = self._tensor(f"{name}.memmap", record, where)
+            if not 0 <= length <= (len(values) if values.ndim else 0):
+                raise ValueError(
+                    f"{where} has the shape {list(values.shape)}, of which {length} rows are filled."
+                )
+            rows[key] = values[:length]
+        return rows
 
     def _member(self, name: str) -> zipfile.ZipInfo:
         if name not in self._members:
@@ -258,7 +268,7 @@ class CheckpointFile:
         self._read(name, content)
         return parse_json(bytes(content), f"{self.file}, {name}")
 
-    def _read(self, name: str, into: memoryview | None = None, output: Any = None) -> None:
+    def _read(self, name: str, into: memoryview | None = None) -> None:
         """Read all of a member, compare its checksums, and put it where it is wanted."""
         digest, done = hashlib.sha256(), 0
         try:
@@ -267,8 +277,6 @@ class CheckpointFile:
                     digest.update(chunk)
                     if into is not None:
                         into[done : done + len(chunk)] = chunk
-                    if output is not None:
-                        output.write(chunk)
                     done += len(chunk)
         except DAMAGED as error:
             raise ValueError(

@@ -165,6 +165,7 @@ class BufferState:
             ValueError: if there are more than the buffer has room for.
         """
         rows, storage = saved["rows"], self._buffer.storage
+        self._buffer.empty()
         if rows:
             length = _length(rows)
             if length > storage.max_size:

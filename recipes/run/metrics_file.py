@@ -32,8 +32,12 @@ def read_metrics(file: Path) -> tuple[list[str], list[list[str]]]:
         raise ValueError(
             f"{file} has the columns {shown(heading)}, expected {FRAMES!r} first, and {SECONDS!r}."
         )
+    before = -1
     for number, row in whole:
         _check_row(file, number, heading, row)
+        if int(row[0]) <= before:
+            raise ValueError(f"{file}, line {number}: {FRAMES} must grow, got {row[0]} after {before}.")
+        before = int(row[0])
     return heading, [row for _, row in whole]
 
 

@@ -14,6 +14,7 @@ from nht.reading import entry, known_entries, read_json, shortened
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.run.metrics import EVERY_RUN
+from nht.recipes.run.metrics_file import metrics_table
 from nht.recipes.run.ownership import claimed
 from nht.recipes.study.space import VERSION, Value
 from nht.storage import replacing
@@ -142,11 +143,9 @@ def rows_of(job: Job, folder: Path) -> pandas.DataFrame:
     outcome = Ending.read(run)
     assert outcome is not None
     metrics = run / "metrics.csv"
-    measured = (
-        pandas.read_csv(metrics)
-        if metrics.exists()
-        else pandas.DataFrame({name: [float("nan")] for name in EVERY_RUN})
-    )
+    measured = metrics_table(metrics) if metrics.exists() else pandas.DataFrame()
+    if measured.empty:
+        measured = pandas.DataFrame({name: [float("nan")] for name in EVERY_RUN})
     rows = measured.reindex(columns=EVERY_RUN)
     known: dict[str, Value] = {
         "version": VERSION,

@@ -143,12 +143,13 @@ def write_manifest(path: Path, settings: dict[str, Any]) -> None:
     """
     manifest = {"version": VERSION, "settings": settings}
     if path.exists():
-        _check_same(path, _read_manifest(path), manifest)
+        _check_same(path, read_manifest(path), manifest)
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(manifest, indent=1))
 
 
-def _read_manifest(path: Path) -> dict[str, Any]:
+def read_manifest(path: Path) -> dict[str, Any]:
+    """What ``write_manifest`` wrote: ``version`` and ``settings``. Raises ValueError on anything else."""
     manifest = read_json(path)
     known_entries(manifest, ("version", "settings"), str(path))
     entry(manifest, "version", str, str(path))

@@ -197,7 +197,7 @@ def damage_metadata(folder: Path) -> None:
             damage_cut,
             r"the Minari dataset toy-v0 cannot be read: .*main_data.hdf5 cannot be read, it is cut short",
         ),
-        (damage_missing, r"toy-v0 cannot be read, it may be cut short.*episode_2"),
+        (damage_missing, r"toy-v0 cannot be read: .*metadata.json says 3 episodes, main_data.hdf5 has 2"),
         (damage_actions, r"actions in episode 1 of toy-v0 must have shape \(3, 3\), got \(3, 4\)"),
         (
             damage_observations,

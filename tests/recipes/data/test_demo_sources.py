@@ -293,7 +293,7 @@ def test_a_policys_demonstrations_are_what_the_motors_got(run, tmp_path):
     trained = read_config(run)
     map = nht.load_map(run / "map.safetensors")
     env = mapped_env(trained.env, map, seed=0, num_envs=1)
-    action = load_policy(run, env, trained.algo)(demos.data.select("observation").to_tensordict())["action"]
+    action = load_policy(run, env, trained)(demos.data.select("observation").to_tensordict())["action"]
     low, high = (bound[0] for bound in (env.base_env.action_spec.low, env.base_env.action_spec.high))
     expected = map(action, demos.context(["tool_position", "joint_angle"])).clamp(low, high)
     torch.testing.assert_close(demos.actuation, expected)
