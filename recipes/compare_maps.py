@@ -22,7 +22,7 @@ from nht.recipes.config import CompareMaps
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
 from nht.recipes.maps.interface import train_map
-from nht.recipes.maps.kinds import arm_of, find_kind, tasks_with_arm
+from nht.recipes.maps.kinds import arm_of, file_name, find_kind, make_map, map_context_keys, tasks_with_arm
 
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
@@ -50,28 +50,31 @@ def main(config: CompareMaps) -> None:
     fixed = {kind for kind in config.maps if find_kind(kind).fixed_width}
     if not config.maps or not config.action_dims:
         raise ValueError(f"nothing to compare: got maps={config.maps} and action_dims={config.action_dims}.")
+    torch.set_num_threads(config.torch_threads)
     demos = nht.load_demos(config.demos.path, env=config.env.name)
-    rows, maps = [], {}
-    for kind in config.maps:
-        for action_dim in config.action_dims[:1] if kind in fixed else config.action_dims:
-            trained = _trained(config, kind, action_dim)
-            maps[kind, trained.map.action_dim] = trained.map
-            rows.append({"map": kind, "k": trained.map.action_dim, **_measured(trained, demos)})
-    table = pandas.DataFrame(rows)
+    chosen = [
+        replace(config.map, kind=kind, action_dim=action_dim)
+        for kind in config.maps
+        for action_dim in (config.action_dims[:1] if kind in fixed else config.action_dims)
+    ]
+    for settings in chosen:  # whether all can be made, before the first is trained
+        width = demos.context(map_context_keys(settings, config.env)).shape[-1]
+        make_map(settings, width, demos.actuation.shape[-1], config.seed, config.env)
+    rows, maps, table = [], {}, pandas.DataFrame()
     out.mkdir(parents=True)
-    table.to_csv(out / "table.csv", index=False)
-    (out / "table.md").write_text(_markdown(table))
-    for (kind, k), map in maps.items():
-        nht.save_map(map, out / "maps" / f"{kind}-k{k}.safetensors")
+    for settings in chosen:
+        trained = train_map(settings, config.env, config.demos, config.seed)
+        kind, k = settings.kind, trained.map.action_dim
+        maps[kind, k] = trained.map
+        nht.save_map(trained.map, out / "maps" / f"{file_name(kind)}-k{k}.safetensors")
+        rows.append({"map": kind, "k": k, **_measured(trained, demos)})
+        table = pandas.DataFrame(rows)
+        table.to_csv(out / "table.csv", index=False)
+        (out / "table.md").write_text(_markdown(table))
     _plot(table, out / "error.png")
     _draw(config, maps, demos, out)
     print((out / "table.md").read_text())
     print(f"saved in {out}")
-
-
-def _trained(config: CompareMaps, kind: str, action_dim: int) -> nht.MapTraining:
-    settings = replace(config.map, kind=kind, action_dim=action_dim)
-    return train_map(settings, config.env, config.demos, config.seed)
 
 
 def _measured(trained: nht.MapTraining, demos: nht.Demos) -> dict[str, float]:

@@ -68,6 +68,7 @@ class TrainMap:
     align: str | None = None  # tool: action axis 1 moves the arm's tool along x, 2 along y, 3 along z
     seed: int = 0
     device: str = "cpu"
+    torch_threads: int = 1
     out: str = path_field("")
 
     def __post_init__(self) -> None:
@@ -99,6 +100,7 @@ class CompareMaps:
     maps: list[str] = field(default_factory=lambda: ["nht", "laser", "svd", "scl"])
     action_dims: list[int] = field(default_factory=lambda: [1, 2, 3])
     seed: int = 0
+    torch_threads: int = 1
     out: str = path_field("")
 
 

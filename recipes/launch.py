@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nht.envs import TASKS
 from nht.envs.table import Table
+from nht.recipes.hydra_internals import choices, listed_choices, reason, unknown_key
 from nht.recipes.maps.kinds import KINDS
 from nht.recipes.sections import Training
 
@@ -124,8 +125,7 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
         texts = [_as_text(schema, word) for word in _named(schema, overrides)]
         return cast(Config, _at_home(OmegaConf.to_object(_compose(schema, name, texts))))
     except (HydraException, OmegaConfBaseException) as error:
-        reason = str(error.__cause__ or error).splitlines()[0]
-        raise ValueError(f"{str(error).splitlines()[0]} ({reason}){_existing(schema, error)}") from error
+        raise ValueError(f"{reason(error)}{_existing(schema, error)}") from error
 
 
 def _named(schema: type[Any], overrides: Sequence[str]) -> Iterator[str]:
@@ -144,11 +144,8 @@ def _named(schema: type[Any], overrides: Sequence[str]) -> Iterator[str]:
 
 
 def _has_yaml(group: str, choice: str) -> bool:
-    from hydra.core.global_hydra import GlobalHydra
-
     with initialize_config_module("nht.configs", version_base="1.3"):
-        loader = GlobalHydra.instance().config_loader()
-        return choice in loader.get_group_options(group)
+        return choice in choices(group)
 
 
 def _at_home(config: Any) -> Any:
@@ -174,10 +171,7 @@ def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConf
 
 def _primary(schema: type[Any], name: str) -> str:
     """The recipe's YAML file; of a recipe without one, what any training starts from."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    loader = GlobalHydra.instance().config_loader()
-    if name in loader.get_group_options(""):
+    if name in choices(""):
         return name
     groups: list[Any] = [f"{name}_schema"]
     if issubclass(schema, Training):
@@ -200,15 +194,13 @@ def _opened(node: DictConfig) -> DictConfig:
     return node
 
 
-def _existing(schema: type[Any], error: Exception) -> str:
+def _existing(schema: type[Any], error: HydraException | OmegaConfBaseException) -> str:
     """Names that exist where the error's key was looked for."""
-    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
-    full_key = getattr(cause, "full_key", None)
-    if not full_key:
-        # The lines after the first list the choices of a config group, where that was the mistake.
-        return " ".join(["", *str(error).splitlines()[1:]])
+    key = unknown_key(error)
+    if key is None:
+        return listed_choices(error)
     node: Any = schema()
-    for part in full_key.split(".")[:-1]:
+    for part in key.split(".")[:-1]:
         node = getattr(node, part, node)
     names = [entry.name for entry in fields(node)] if is_dataclass(node) else []
     return f". Keys here: {names}." if names else ""

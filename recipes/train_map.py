@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 import nht
 from nht.recipes.config import TrainMap
 from nht.recipes.launch import launch
@@ -18,6 +20,7 @@ def main(config: TrainMap) -> None:
     out = Path(config.out)
     if out.exists():
         raise FileExistsError(f"{out} exists: maps are never overwritten. Choose another file.")
+    torch.set_num_threads(config.torch_threads)
     trained = train_map(config.map, config.env, config.demos, config.seed, config.device, align=config.align)
     nht.save_map(trained.map, out)
     for name, value in trained.metrics.items():

@@ -19,6 +19,8 @@ from torchrl.objectives.common import LossModule
 
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import AlgoConfig
+from nht.recipes.torch_internals import lerp_all
+from nht.recipes.torchrl_internals import followed_pairs
 
 STORED = (
     "observation",
@@ -168,12 +170,10 @@ class JointSoftUpdate(SoftUpdate):
 
     def __init__(self, loss: LossModule, *, eps: float) -> None:
         super().__init__(loss, eps=eps)
-        names = list(self._sources.keys())
-        self._learned = [leaf.data for name in names for leaf in self._sources[name].values(True, True)]
-        self._followers = [
-            leaf.data for name in names for leaf in self._targets[f"target_{name}"].values(True, True)
-        ]
+        pairs = list(followed_pairs(self))
+        self._learned = [source.data for source, _ in pairs]
+        self._followers = [target.data for _, target in pairs]
 
     def step(self) -> None:
         """Move the target networks."""
-        torch._foreach_lerp_(self._followers, self._learned, 1.0 - self.eps)
+        lerp_all(self._followers, self._learned, 1.0 - self.eps)

@@ -108,6 +108,11 @@ def find_kind(name: str) -> MapKind:
         raise ValueError(f"the map kind {name!r} cannot be found: {error}") from error
 
 
+def file_name(kind: str) -> str:
+    """A kind's name as part of a file's."""
+    return kind.replace(":", ".")
+
+
 def known_task(env: EnvConfig) -> TaskRecord | None:
     """The record of the task that ``env`` names, if it is one of the table of tasks."""
     return find_task(env.name) if env.suite == "nht" and env.name in TASKS else None

@@ -8,10 +8,11 @@ from typing import Any, Protocol, cast
 import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.envs import TransformedEnv
 
 from nht.recipes.sections import CollectorConfig
+from nht.recipes.torchrl_internals import FirstComeCollector, carrier, count_frames_from, counted_frames
 
 
 class MakeEnv(Protocol):
@@ -59,21 +60,6 @@ def make_collector(
     return FirstComeCollector(makers, policy, **settings)
 
 
-class FirstComeCollector(MultiAsyncCollector):
-    """``MultiAsyncCollector`` that tells from which worker the latest batch came.
-
-    Attributes:
-        latest: number of that worker.
-    """
-
-    latest = 0
-
-    def _get_from_queue(self, timeout: float | None = None) -> Any:
-        received = super()._get_from_queue(timeout)
-        self.latest = received[0]
-        return received
-
-
 def batch_copies(collector: BaseCollector, copies: int) -> slice:
     """Which of a learner's copies made the latest batch: all, or the ``copies`` of one worker."""
     if not isinstance(collector, FirstComeCollector):
@@ -95,23 +81,30 @@ def _in_worker(make_env: MakeEnv, seed: int) -> TransformedEnv:
 class CollectorState:
     """Where a collector stands between two batches (observation, exploration noise, counted steps), to be checkpointed.
 
-    Workers keep theirs to themselves: they go on with new episodes, on seeds that follow from how far the run has come.
+    Workers keep theirs to themselves, and so do simulators that cannot be saved: they go on with new episodes, on seeds
+    that follow from how far the run has come.
+
+    Args:
+        collector: whose state it is.
+        seed: that the seeds of new episodes follow from.
+        exact: whether the simulator behind it can be saved, so that episodes go on.
     """
 
-    def __init__(self, collector: BaseCollector, seed: int) -> None:
+    def __init__(self, collector: BaseCollector, seed: int, *, exact: bool = True) -> None:
         self._collector, self._seed = collector, seed
+        self._exact = exact and isinstance(collector, Collector)
 
     def state_dict(self) -> dict[str, Any]:
         """Every entry that the next step starts from, and how many steps were made: the first may be random ones."""
-        saved: dict[str, Any] = {"frames": self._collector._frames}
-        if isinstance(self._collector, Collector):
-            saved["carrier"] = self._collector._carrier.to_dict()
+        saved: dict[str, Any] = {"frames": counted_frames(self._collector)}
+        if self._exact:
+            saved["carrier"] = carrier(cast(Collector, self._collector)).to_dict()
         return saved
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Start the next step from ``saved``."""
-        self._collector._frames = saved["frames"]
-        if isinstance(self._collector, Collector):
-            self._collector._carrier.update(saved["carrier"])
+        count_frames_from(self._collector, saved["frames"])
+        if self._exact:
+            carrier(cast(Collector, self._collector)).update(saved["carrier"])
         else:
             cast(Any, self._collector).set_seed(worker_seed(self._seed, saved["frames"]))

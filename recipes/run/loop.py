@@ -73,13 +73,18 @@ class Loop:
             random_frames=random_frames // ranks.size,
         )
         self._alone = isinstance(self.collector, Collector)
+        simulation = envs.train.base_env.task
         if self._alone:
-            parts["simulator"] = envs.train.base_env.task
+            parts["simulator"] = simulation
+        if ranks.first and not simulation.can_resume:
+            print(
+                f"{folder.path.name}: {simulation.resume_obstacle}. A run that is stopped goes on with new episodes."
+            )
         self._checkpoints = Checkpoints(
             folder.path / "checkpoints" / ranks.folder,
             loss=loss,
             **parts,
-            collector=CollectorState(self.collector, envs.seed),
+            collector=CollectorState(self.collector, envs.seed, exact=simulation.can_resume),
             test_simulator=envs.test.base_env.task,
             counters=record.counters,
             statistics=record.statistics,

@@ -96,6 +96,10 @@ class TrainingStatistics:
         for name, value in sums.items():
             if not math.isfinite(value):
                 raise FloatingPointError(f"{name} is {value}: training diverged. Lower the learning rates.")
+        if steps and sums[DIVERGED] >= steps:
+            raise FloatingPointError(
+                f"every one of {steps:.0f} steps diverged: actuations or physics are not finite. Look at the map."
+            )
         row = {
             trained(SUCCESS): sums[SUCCESS] / (episodes or math.nan),
             trained(FAILURE): sums[FAILURE] / (episodes or math.nan),

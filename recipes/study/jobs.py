@@ -53,7 +53,7 @@ class Job:
 
 
 def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
-    """By which a run is known."""
+    """The name of a run, and of its folder below the search's."""
     return f"{stage}/{interface}/{configuration:03d}-seed{seed}"
 
 

@@ -100,7 +100,7 @@ def test_dictionaries_take_new_keys_and_nothing_else_does():
         ("algo.gamma=1.0", r"algo.gamma must lie in \(0, 1\), got 1.0"),
         ("algo.polyak=-0.1", r"algo.polyak must lie in \[0, 1\], got -0.1"),
         ("algo.batch_size=0", "algo.batch_size must be at least 1, got 0"),
-        ("algo.noise_memory=0.5", "algo.noise_memory must be at least 1 step, got 0.5"),
+        ("algo.noise_memory=0.5", "algo.noise_memory must be at least 1, got 0.5"),
         ("env.num_envs=7", "algo.frames_per_batch=200 must be a multiple of env.num_envs=7"),
         ("evaluation.every=300", "evaluation.every must be a multiple of algo.frames_per_batch=200, got 300"),
         ("--multirun", "unknown flag '--multirun'.*multirun.*is not supported"),

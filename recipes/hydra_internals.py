@@ -1,0 +1,29 @@
+"""What the recipes rely on in Hydra beside its public interface; tests fail by name when an upgrade breaks one."""
+
+from __future__ import annotations
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+
+def choices(group: str) -> list[str]:
+    """The YAML files of a group, ``""`` for the recipes' own, from Hydra's config loader while it is initialised."""
+    return list(GlobalHydra.instance().config_loader().get_group_options(group))
+
+
+def reason(error: HydraException | OmegaConfBaseException) -> str:
+    """Why Hydra refused, in a line: the first line of its message, and of the cause's."""
+    cause = str(error.__cause__ or error).splitlines()[0]
+    return f"{str(error).splitlines()[0]} ({cause})"
+
+
+def unknown_key(error: HydraException | OmegaConfBaseException) -> str | None:
+    """The dotted name at which Hydra found nothing: OmegaConf's ``full_key``."""
+    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    return getattr(cause, "full_key", None) or None
+
+
+def listed_choices(error: HydraException | OmegaConfBaseException) -> str:
+    """The choices of a group that Hydra lists after the first line, where that was the mistake."""
+    return " ".join(["", *str(error).splitlines()[1:]])
