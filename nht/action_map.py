@@ -80,7 +80,7 @@ class ActionMap(nn.Module, ABC):
         self.action_dim = operator.index(action_dim)
         self.context_keys: tuple[NestedKey, ...] | None = None
         self.data_fingerprint: str | None = None
-        self.saturation = DEFAULT_SATURATION
+        self.saturation = DEFAULT_SATURATION if action_dim < actuation_dim else "clip"
         self.register_buffer("action_scale", torch.ones(()))
         self.register_buffer("actuation_low", torch.full((self.actuation_dim,), -torch.inf))
         self.register_buffer("actuation_high", torch.full((self.actuation_dim,), torch.inf))
