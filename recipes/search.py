@@ -25,7 +25,8 @@ from nht.recipes.run.ownership import claimed
 from nht.recipes.study.cluster import Cluster
 from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
 from nht.recipes.study.report import summary
-from nht.recipes.study.results import COLUMNS, SearchResults, read_results
+from nht.recipes.study.results import SearchResults, read_results
+from nht.recipes.study.rows_file import COLUMNS
 from nht.recipes.study.space import draw, write_manifest
 from nht.storage import replacing
 
