@@ -148,7 +148,8 @@ def _read_plain(folder: Path, record: dict[str, Any]) -> TensorDict:
 
 def _read_stack(folder: Path, record: dict[str, Any]) -> TensorDictBase:
     file = folder / META
-    dim, parts = entry(record, "stack_dim", int, str(file)), []
+    dim: int = entry(record, "stack_dim", int, str(file))
+    parts: list[Any] = []
     while (part := folder / str(len(parts))).exists():
         parts.append(_read(_inner(folder, part.name, str(part))))
     shapes = {tuple(part.batch_size) for part in parts if isinstance(part, TensorDictBase)}
@@ -254,4 +255,4 @@ def write_tensordict(data: TensorDictBase, folder: Path) -> None:
 
 def raw(value: Tensor) -> memoryview:
     """The bytes of a tensor's values, in order."""
-    return memoryview(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
+    return value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data

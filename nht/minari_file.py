@@ -123,7 +123,7 @@ def _check_box(space: dict[str, Any], where: str) -> None:
         raise ValueError(f"{where}: {shortened(space['dtype'], 60)!r} is no type of numbers.")
     for name in ("low", "high"):
         try:
-            found = np.shape(space.get(name))
+            found: Any = np.shape(entry(space, name, (list, int, float), where))
         except ValueError:
             found = None
         if found != tuple(shape):

@@ -58,8 +58,11 @@ def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
     sums: dict[str, str] = {}
     with zipfile.ZipFile(file, "x", zipfile.ZIP_STORED) as archive:
         for number, (name, state) in enumerate(sorted(parts.items())):
-            folder, tensors = f"components/{number:04d}-{name}", {}
-            files = {"state.json": json.dumps(encoded(state, tensors), separators=(",", ":")).encode()}
+            folder = f"components/{number:04d}-{name}"
+            tensors: dict[str, Tensor] = {}
+            files: dict[str, bytes | Tensor] = {
+                "state.json": json.dumps(encoded(state, tensors), separators=(",", ":")).encode()
+            }
             about: dict[str, Any] = {key: _about(value) for key, value in tensors.items()}
             about |= {"shape": [], "device": "cpu", "_type": PLAIN}
             files["state/meta.json"] = json.dumps(about, separators=(",", ":")).encode()

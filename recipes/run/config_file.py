@@ -36,7 +36,8 @@ def read_settings(file: Path) -> dict[str, Any]:
 
 
 def _check_values(settings: dict[str, Any], file: Path) -> None:
-    left, count = [settings], 0
+    left: list[Any] = [settings]
+    count = 0
     while left:
         value, count = left.pop(), count + 1
         if count > MOST:

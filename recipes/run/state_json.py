@@ -32,11 +32,10 @@ def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
             {} if about is None else {"metadata": encoded(about, tensors)}
         )
     if isinstance(value, (list, tuple)):
-        kind = (
-            "torch_size" if isinstance(value, torch.Size) else "list" if isinstance(value, list) else "tuple"
-        )
-        items = list(value) if kind == "torch_size" else [encoded(item, tensors) for item in value]
-        return {"kind": kind, "items": items}
+        if isinstance(value, torch.Size):
+            return {"kind": "torch_size", "items": list(value)}
+        kind = "list" if isinstance(value, list) else "tuple"
+        return {"kind": kind, "items": [encoded(item, tensors) for item in value]}
     if isinstance(value, np.generic):
         return {"kind": "numpy_scalar", "dtype": value.dtype.str, "value": value.item()}
     if value is None or isinstance(value, (bool, int, float, str)):
