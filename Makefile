@@ -56,7 +56,7 @@ demo: setup ## The main job: demonstrations, map, DDPG through it and on raw joi
 	@OMP_NUM_THREADS=1 ./demo.sh $(BIN)/python
 
 bench: setup ## Measure speed and what the maps can do; the learning runs are in benchmarks/README.md
-	@for file in benchmarks/*.py; do echo "== $$file"; OMP_NUM_THREADS=1 $(BIN)/python "$$file"; done
+	@for file in benchmarks/speed/*.py benchmarks/maps/*.py; do echo "== $$file"; OMP_NUM_THREADS=1 $(BIN)/python "$$file"; done
 
 clean: ## Remove what building and the tools left; .venv and runs/ stay
 	rm -rf build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 # On the CPU, not compiled, from so many reflectors on and up to so large a batch, all reflections at once are 1.2 to
 # 1.8 times as fast as one by one, for k calls take longer than their arithmetic. Elsewhere one by one is the fastest
-# of all that are exact to 1e-6, up to 10 times ahead: benchmarks/householder.py.
+# of all that are exact to 1e-6, up to 10 times ahead: benchmarks/speed/householder.py.
 MANY_REFLECTORS, SMALL_BATCH = 12, 8
 
 

@@ -313,7 +313,7 @@ def test_the_compiled_package_runs_in_python_and_cpp(tmp_path: Path) -> None:
         action, context = some(map, batch)
         expected = map(action, context).detach()
         torch.testing.assert_close(package(action, context), expected, rtol=1e-6, atol=1e-6)
-    benchmark = runpy.run_path(str(BENCHMARKS / "export_latency.py"))
+    benchmark = runpy.run_path(str(BENCHMARKS / "speed" / "export_latency.py"))
     actuation, times = benchmark["run_loop"](benchmark["build_loop"](tmp_path), path, map, 10)
     expected = map(torch.ones(1, 2), torch.ones(1, 10)).detach()
     torch.testing.assert_close(actuation, expected, rtol=1e-6, atol=1e-6)
