@@ -170,5 +170,7 @@ class ExportMap:
     file: str = path_field("")  # a saved map
     out: str = path_field("")  # name.onnx or name.pt2; replaced if it exists
     action_scale: float | None = None  # what an action of 1 is worth; None is what the map says
+    low: list[float] | None = None  # of each motor: then the program saturates as the map does; None is no limit
+    high: list[float] | None = None
     compiled: bool = False  # .pt2 only: machine code, for C++
     allow: list[str] = field(default_factory=list)  # packages whose classes the file may name
