@@ -89,6 +89,11 @@ class LipschitzProjection:
                 NetworkProjection(map.offset_model.network, map.lipschitz, frobenius=frobenius)
             )
 
+    @property
+    def limits(self) -> list[float]:
+        """What the matrices of the basis's network may have at most, layer by layer."""
+        return self.networks[0].limits
+
     def step(self) -> None:
         """After an optimiser step."""
         for network in self.networks:
