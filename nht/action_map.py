@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import operator
 from abc import ABC, abstractmethod
@@ -14,9 +13,10 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from nht.arguments import named_arguments, positional_arguments, recorded
+from nht.arguments import named_arguments, positional_arguments, recording
 from nht.networks import check_choice
 from nht.saturation import DEFAULT_SATURATION, Saturation, saturate
+from nht.widths import checked_forward, checked_project
 
 WRAPPED = "_nht_wrapped"
 
@@ -61,13 +61,13 @@ class ActionMap(nn.Module, ABC):
         """Lets every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
         super().__init_subclass__(**kwargs)
         for name, wrap in (
-            ("__init__", _recording),
-            ("forward", _checked_forward),
-            ("project", _checked_project),
+            ("__init__", recording),
+            ("forward", checked_forward),
+            ("project", checked_project),
         ):
             method = getattr(cls, name)
             if not getattr(method, "__isabstractmethod__", False) and not hasattr(method, WRAPPED):
-                setattr(cls, name, wrap(method))
+                setattr(cls, name, _marked(wrap(method)))
 
     def __init__(self, context_dim: int, actuation_dim: int, action_dim: int) -> None:
         super().__init__()
@@ -227,47 +227,9 @@ class ActionMap(nn.Module, ABC):
         self.actuation_high.copy_(map.actuation_high)
 
 
-def _recording(constructor: Callable[..., None]) -> Callable[..., None]:
-    """A constructor that remembers what the outermost one was given."""
-
-    @functools.wraps(constructor)
-    def __init__(self: ActionMap, *args: Any, **kwargs: Any) -> None:  # noqa: N807 (tracebacks show this name)
-        if "_recorded_arguments" not in self.__dict__:
-            self.__dict__["_recorded_arguments"] = recorded(self, args, kwargs)
-        constructor(self, *args, **kwargs)
-
-    return _marked(cast(FunctionType, __init__))
-
-
-def _checked_forward(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    @functools.wraps(method)
-    def forward(self: ActionMap, action: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-        _check_width(self, "an action", action, self.action_dim)
-        _check_width(self, "a context", context, self.context_dim)
-        return method(self, action, context, *args, **kwargs)
-
-    return _marked(cast(FunctionType, forward))
-
-
-def _checked_project(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    @functools.wraps(method)
-    def project(self: ActionMap, actuation: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-        _check_width(self, "an actuation", actuation, self.actuation_dim)
-        _check_width(self, "a context", context, self.context_dim)
-        return method(self, actuation, context, *args, **kwargs)
-
-    return _marked(cast(FunctionType, project))
-
-
-def _check_width(map: ActionMap, what: str, given: Tensor, expected: int) -> None:
-    if given.ndim < 1 or given.shape[-1] != expected:
-        raise ValueError(
-            f"{type(map).__name__} takes {what} of width {expected}, got one of shape {tuple(given.shape)}."
-        )
-
-
-def _marked(method: FunctionType) -> Callable[..., Any]:
+def _marked(method: Callable[..., Any]) -> Callable[..., Any]:
     """Lets no subclass wrap it again, and gives it code of its own: compilers count their attempts by that."""
-    method.__code__ = method.__code__.replace()
-    setattr(method, WRAPPED, True)
-    return method
+    function = cast(FunctionType, method)
+    function.__code__ = function.__code__.replace()
+    setattr(function, WRAPPED, True)
+    return function

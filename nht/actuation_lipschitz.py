@@ -75,8 +75,8 @@ def _stretch(map: ActionMap, largest_action: float, low: Tensor | None, high: Te
     """S: by how much scaling into the limits may bring actuations apart."""
     least, most = _rest_range(map)
     unlimited = torch.full((map.actuation_dim,), torch.inf, dtype=torch.float64)
-    up = unlimited if high is None else high.double().cpu().expand(map.actuation_dim)
-    down = -unlimited if low is None else low.double().cpu().expand(map.actuation_dim)
+    up = unlimited if high is None else torch.as_tensor(high).double().cpu().expand(map.actuation_dim)
+    down = -unlimited if low is None else torch.as_tensor(low).double().cpu().expand(map.actuation_dim)
     norm = _basis_norm(map)
     reach = norm * largest_action if largest_action else 0.0  # of |d|
     # A facet is met no closer than `nearest`; beside it x may be as long as the other motors' largest rooms allow.

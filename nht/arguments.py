@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from torch import nn
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.VAR_POSITIONAL)
+
+
+def recording(constructor: Callable[..., None]) -> Callable[..., None]:
+    """A constructor that remembers what the outermost one was given, in the attribute ``_recorded_arguments``."""
+
+    @functools.wraps(constructor)
+    def __init__(self: nn.Module, *args: Any, **kwargs: Any) -> None:  # noqa: N807 (tracebacks show this name)
+        if "_recorded_arguments" not in self.__dict__:
+            self.__dict__["_recorded_arguments"] = recorded(self, args, kwargs)
+        constructor(self, *args, **kwargs)
+
+    return __init__
 
 
 def recorded(map: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from typing import Any
 
 from nht.action_map import ActionMap
+from nht.arguments import plain
 from nht.lipschitz import certificate
 from nht.map_classes import find_by_name, find_class, identity
 
@@ -108,7 +109,7 @@ def _encoded(value: Any) -> Any:
         return {"dict": {key: _encoded(one) for key, one in value.items()}}
     if isinstance(value, list | tuple):
         return [_encoded(one) for one in value]
-    return value
+    return plain(value)
 
 
 def _decoded(value: Any, allow: Sequence[str]) -> Any:

@@ -95,8 +95,9 @@ def _import(module: str, name: str, allow: Sequence[str]) -> None:
         )
     try:
         importlib.import_module(module)
-    except ImportError as error:
-        raise ValueError(f"its class {name!r} needs the module {module!r}: {error}.") from error
+    except Exception as error:  # a module may raise anything
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"its class {name!r} needs the module {module!r}: {reason}.") from error
 
 
 def _concrete() -> Iterator[type[ActionMap]]:

@@ -19,9 +19,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 
 from nht.action_map import ActionMap
+from nht.allowance import Allowance
+from nht.arguments import plain
 from nht.description import describe, of_version_1, twin
 from nht.replacing import replacing
 
@@ -29,8 +30,6 @@ __all__ = ["check_storable", "describe", "load_map", "replacing", "save_map"]
 
 FORMAT = "nht.action_map"
 FORMAT_VERSION = 2
-BOUNDS = ("actuation_low", "actuation_high")  # buffers that may be infinite
-FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.eye, torch.rand, torch.randn)
 LONGEST_REASON = 600  # characters of what an error says about a file
 
 
@@ -46,11 +45,11 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
 
     Raises:
         TypeError: if an argument of the constructor cannot stand in a file; `train_map` says so before it trains.
-        ValueError: if a weight is not finite.
+        ValueError: if a weight is not finite, or a map loaded from the file would be another one.
     """
     path = Path(path)
     tensors = _tensors(map)
-    _check_finite(map, tensors)
+    _check_finite(tensors, check_storable(map).state_dict())
     text = json.dumps(describe(map))
     header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": text}
     header["checksum"] = _checksum(text, tensors)
@@ -80,56 +79,55 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
     path = Path(path)
     _check_readable(path)
     try:
-        return _loaded(path, allow).to(device).eval().requires_grad_(False)
+        map = _loaded(path, allow)
     except Exception as error:  # whatever stands in a file, the answer names the file
         known = isinstance(error, ValueError) and not isinstance(error, UnicodeError | json.JSONDecodeError)
         reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
         raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}") from error
+    return map.to(device).eval().requires_grad_(False)
 
 
 @torch.no_grad()
-def check_storable(map: ActionMap) -> None:
+def check_storable(map: ActionMap) -> ActionMap:
     """Builds the twin that a file of this map would give, so that what cannot be saved shows before it is trained.
+
+    Returns:
+        The twin: constructed alike, not trained.
 
     Raises:
         TypeError: if an argument of the constructor cannot stand in a file, or the state is not all of tensors.
         ValueError: if the twin is another map.
     """
-    name = type(map).__name__
-    tensors = _tensors(map)
-    positional, named = (
-        json.loads(json.dumps(_listed(part))) for part in (map.init_positional(), map.init_args())
-    )
+    refused = f"{type(map).__name__} could not be loaded after saving"
+    given = _listed(map)
     try:
         other = type(map)(*map.init_positional(), **map.init_args())
-        again = json.loads(json.dumps([_listed(other.init_positional()), _listed(other.init_args())]))
-    except Exception as error:
+    except Exception as error:  # of a constructor of any kind
+        raise ValueError(f"{refused}: {given} raise {type(error).__name__}: {error}") from error
+    if (again := _listed(other)) != given:
         raise ValueError(
-            f"{name} could not be loaded after saving: constructed from {_listed(named)}, it raises "
-            f"{type(error).__name__}: {error}"
-        ) from error
-    if again != [positional, named]:
-        raise ValueError(
-            f"{name} could not be loaded after saving: an attribute named like an argument of the constructor must be "
-            f"that argument, but {[positional, named]} turns into {again}."
+            f"{refused}: an attribute named like an argument of the constructor must be that argument, but "
+            f"{given} turns into {again}."
         )
     shapes, expected = (
-        {key: value.shape for key, value in part.items()} for part in (other.state_dict(), tensors)
+        {(key, value.shape) for key, value in state.items()} for state in (other.state_dict(), _tensors(map))
     )
     if shapes != expected:
-        changed = sorted({*shapes.items()} ^ {*expected.items()})
-        raise ValueError(
-            f"{name} could not be loaded after saving: constructed again, its weights differ: {changed}."
-        )
+        raise ValueError(f"{refused}: constructed again, its weights differ: {sorted(shapes ^ expected)}.")
+    return other
 
 
-def _listed(value: Any) -> Any:
-    """Arguments for comparison: a map among them by its class and arguments."""
-    if isinstance(value, ActionMap):
-        return [type(value).__qualname__, _listed(value.init_positional()), _listed(value.init_args())]
-    if isinstance(value, dict):
-        return {key: _listed(one) for key, one in value.items()}
-    return [_listed(one) for one in value] if isinstance(value, list | tuple) else value
+def _listed(map: ActionMap) -> str:
+    """The constructor's arguments, as text to compare."""
+
+    def listed(value: Any) -> Any:
+        if isinstance(value, ActionMap):
+            return {type(value).__name__: [listed(value.init_positional()), listed(value.init_args())]}
+        if isinstance(value, dict):
+            return {key: listed(one) for key, one in value.items()}
+        return [listed(one) for one in value] if isinstance(value, list | tuple) else plain(value)
+
+    return json.dumps(listed(map))
 
 
 def _tensors(map: ActionMap) -> dict[str, Tensor]:
@@ -177,11 +175,11 @@ def _loaded(path: Path, allow: Sequence[str]) -> ActionMap:
     description = json.loads(text)
     if found == "1":
         description = of_version_1(description)
-    with _Allowance(sum(value.nbytes for value in tensors.values())):
+    with Allowance(sum(value.nbytes for value in tensors.values())):
         map = twin(description, allow)
+    _check_finite(tensors, map.state_dict())
     _fill(map, tensors)
     _check_description(map, description)
-    _check_finite(map, tensors)
     return map
 
 
@@ -191,29 +189,6 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
             return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise ValueError(f"is no safetensors file, or is cut short: {error}.") from error
-
-
-class _Allowance(TorchFunctionMode):
-    """Lets the constructor make no more than the file can fill, for a small file could ask for any amount of memory."""
-
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.size, self.left = size, 4 * size + 2**24  # bytes; what is made on the way counts too
-
-    def __torch_function__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        kwargs = kwargs or {}
-        if func in FACTORIES:
-            sized = {
-                key: value for key, value in kwargs.items() if key not in ("generator", "out", "pin_memory")
-            }
-            self.left -= func(*args, **sized | {"device": "meta"}).nbytes
-            if self.left < 0:
-                raise ValueError(
-                    f"describes a map far larger than the {self.size} bytes of weights that it holds."
-                )
-        return func(*args, **kwargs)
 
 
 def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
@@ -251,11 +226,12 @@ def _check_description(map: ActionMap, description: dict[str, Any]) -> None:
             )
 
 
-def _check_finite(map: ActionMap, tensors: dict[str, Tensor]) -> None:
-    scale = float(map.action_scale)
-    if not 0 < scale < math.inf:
-        raise ValueError(f"holds a map whose action_scale is {scale}; it must be positive and finite.")
+def _check_finite(tensors: dict[str, Tensor], untrained: dict[str, Any]) -> None:
+    """No NaN; infinities, as of bounds, only where the untrained map has some, too."""
+    scale = tensors.get("action_scale")
+    if scale is None or scale.ndim or not 0 < float(scale) < math.inf:
+        raise ValueError(f"holds a map whose action_scale is {scale}; it must be a positive, finite number.")
     for key, value in tensors.items():
-        bound = key.rpartition(".")[2] in BOUNDS
-        if not (~value.isnan() if bound else value.isfinite()).all():
+        unbounded = key in untrained and bool(untrained[key].isinf().any())
+        if not (~value.isnan() if unbounded else value.isfinite()).all():
             raise ValueError(f"holds a map whose {key} is not finite everywhere.")

@@ -163,7 +163,9 @@ def test_modules_that_cannot_help_are_named(tmp_path: Path) -> None:
     finally:
         del sys.modules["passing_module"]
     relabel(path, module="module_that_never_was", **{"class": "Twofold"})
-    with pytest.raises(ValueError, match="needs the module 'module_that_never_was': No module named"):
+    with pytest.raises(
+        ValueError, match="needs the module 'module_that_never_was': ModuleNotFoundError: No module"
+    ):
         load_map(path, allow=("module_that_never_was",))
     relabel(path, module="pathlib", **{"class": "Path"})
     with pytest.raises(ValueError, match="the module 'pathlib' is imported, but has no action map 'Path'"):
@@ -214,6 +216,9 @@ class Settings(nht.Identity):
     def __init__(self, size: Any, *, options: Any = None, largest: float = math.inf) -> None:
         super().__init__(size)
         self.register_buffer("table", torch.arange(3, dtype=torch.float64))
+        self.register_buffer(
+            "limits", torch.tensor([-math.inf, math.inf])
+        )  # an infinity that means something
 
 
 class Keeps(nht.Identity):
@@ -429,6 +434,11 @@ def test_numbers_that_are_not_finite_are_neither_saved_nor_loaded(
     changed(path, {name: map.state_dict()[name]})
     with pytest.raises(ValueError, match=message):
         load_map(path)
+
+
+def test_a_device_that_is_not_there_is_no_fault_of_the_file(path: Path) -> None:
+    with pytest.raises(RuntimeError, match="nowhere"):
+        load_map(path, "nowhere")
 
 
 def test_version_1_must_not_contradict_itself(path: Path) -> None:

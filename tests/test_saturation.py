@@ -275,6 +275,12 @@ def test_the_jacobian_works_in_half_precision(dtype: torch.dtype) -> None:
     torch.testing.assert_close(actuation.float(), map.float().decode(action, context), rtol=0.1, atol=0.02)
 
 
+def test_where_the_span_is_everything_there_is_nothing_to_stay_in() -> None:
+    assert nht.NHT(CONTEXT_DIM, 5, 4, (8,)).saturation == nht.SVD(5, 1).saturation == "scale"
+    assert nht.NHT(CONTEXT_DIM, 5, 5, (8,)).saturation == nht.Identity(5).saturation == "clip"
+    assert nht.Residual(nht.SVD(5, 1), 0.1).saturation == "scale"  # that of the map inside
+
+
 def test_the_default_and_what_is_set_survive_copies() -> None:
     map = nht.NHT(CONTEXT_DIM, 5, 2, (8,))
     other = {"scale": "clip", "clip": "scale"}[map.saturation]

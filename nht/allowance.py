@@ -1,0 +1,38 @@
+"""How much memory a map's constructor may ask for: a file of two kilobytes could describe networks of any size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.eye, torch.rand, torch.randn)
+SLACK = 2**24  # [bytes]
+
+
+class Allowance(TorchFunctionMode):
+    """While this is entered, tensors that are made out of nothing may not be much larger than a file's weights.
+
+    Args:
+        size: of the weights that the file holds [bytes].
+    """
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.size, self.left = size, 4 * size + SLACK  # what is made on the way counts too
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if func in FACTORIES:
+            sized = {
+                key: value for key, value in kwargs.items() if key not in ("generator", "out", "pin_memory")
+            }
+            self.left -= func(*args, **sized | {"device": "meta"}).nbytes
+            if self.left < 0:
+                raise ValueError(
+                    f"describes a map far larger than the {self.size} bytes of weights that it holds."
+                )
+        return func(*args, **kwargs)
