@@ -97,7 +97,7 @@ def test_going_on_from_a_saved_state_is_exact(env):
 def test_runs_through_a_map(env):
     n = env.action_spec.shape[-1]
     map = nht.NHT(env.task.observation_sizes["observation"], n, max(1, n // 2), hidden=(8,))
-    driven = TransformedEnv(env, ActionMapTransform(map, context_keys=["observation"], action_scale=1.0))
+    driven = TransformedEnv(env, ActionMapTransform(map, context_keys=["observation"], saturation="clip"))
     check_env_specs(driven)
     data = driven.rollout(3)
     assert data["action"].shape[-1] == max(1, n // 2)

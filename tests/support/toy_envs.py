@@ -120,7 +120,10 @@ def nest(key: NestedKey, spec: TensorSpec, rows: tuple[int, ...] | None = None) 
 
 
 def toy_map(dtype: torch.dtype = torch.float32) -> ActionMap:
-    return NHT(context_dim=5, actuation_dim=3, action_dim=2, hidden=(8,)).to(dtype)
+    """Clips at the limits, so that what is expected is written down at once."""
+    map = NHT(context_dim=5, actuation_dim=3, action_dim=2, hidden=(8,)).to(dtype)
+    map.saturation = "clip"
+    return map
 
 
 def toy_transform(**options) -> ActionMapTransform:

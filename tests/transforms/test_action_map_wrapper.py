@@ -155,7 +155,7 @@ def test_the_context_is_read_from_the_observation_or_info(observed, keys, dtype)
 
     base = Toy(observed, dtype=dtype)
     map = NHT(read(*base.reset(seed=0)).size, 3, 2, hidden=(8,))
-    env = ActionMapWrapper(base, map, keys, action_scale=SCALE)
+    env = ActionMapWrapper(base, map, keys, action_scale=SCALE, saturation="clip")
     assert env.action_space == Box(-1, 1, (2,), np.float32)
     env.action_space.seed(0)
     context = read(*env.reset(seed=1))
@@ -254,7 +254,9 @@ def leaves(observation):
 @pytest.mark.parametrize("keys", [["observation"], [("raw", "joint")]])
 def test_a_masked_reset_changes_the_context_of_its_rows_only(keys):
     map = NHT(3, 3, 2, hidden=(8,))
-    env = ActionMapVectorWrapper(toys(None, AutoresetMode.DISABLED), map, keys, action_scale=SCALE)
+    env = ActionMapVectorWrapper(
+        toys(None, AutoresetMode.DISABLED), map, keys, action_scale=SCALE, saturation="clip"
+    )
     mask = np.array([True, False])
     with pytest.raises(ResetNeeded, match="first reset must be of all copies"):
         env.reset(options={"reset_mask": mask})

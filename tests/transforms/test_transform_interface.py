@@ -99,10 +99,11 @@ def test_states_saved_when_the_transform_had_a_scale_of_its_own():
     """The scale stood beside the map and held instead of the map's: there were both."""
     old = {f"map.{key}": value for key, value in saturated("clip").state_dict().items()}
     old["action_scale"] = torch.tensor(SCALE)
+    other = NHT(5, 3, 2, hidden=(8,), seed=1)
     for state, target in (
         (
             old,
-            TransformedEnv(ToyArm((3,)), ActionMapTransform(NHT(5, 3, 2, hidden=(8,), seed=1), CONTEXT_KEYS)),
+            TransformedEnv(ToyArm((3,)), ActionMapTransform(other, CONTEXT_KEYS, saturation="clip")),
         ),
         (
             {f"transforms.1.{key}": value for key, value in old.items()},
@@ -110,7 +111,7 @@ def test_states_saved_when_the_transform_had_a_scale_of_its_own():
                 ToyArm((3,)),
                 Compose(
                     ObservationNorm(loc=0.0, scale=1.0, in_keys=["joint"]),
-                    ActionMapTransform(NHT(5, 3, 2, hidden=(8,), seed=1), CONTEXT_KEYS),
+                    ActionMapTransform(other, CONTEXT_KEYS, saturation="clip"),
                 ),
             ),
         ),

@@ -188,7 +188,11 @@ def test_with_scaled_actuations_the_record_is_of_what_was_executed():
 def test_two_maps_in_one_chain():
     """The second map's actuation is the first one's action: base environment 3, first map 2, second map 1."""
     outer = ActionMapTransform(
-        NHT(3, 2, 1, hidden=(8,)), ["joint"], context_key="joint_context", executed_key="inner"
+        NHT(3, 2, 1, hidden=(8,)),
+        ["joint"],
+        saturation="clip",
+        context_key="joint_context",
+        executed_key="inner",
     )
     env = TransformedEnv(ToyArm((3,)), Compose(toy_transform(), outer))
     data = rollout(env)
@@ -293,7 +297,7 @@ def test_gymnasiums_own_vector_environments(before):
 def test_half_cheetah(before, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its log to the working directory
     map = NHT(context_dim=17, actuation_dim=6, action_dim=2, hidden=(16,))
-    transform = ActionMapTransform(map, ["observation"], action_scale=3.0)
+    transform = ActionMapTransform(map, ["observation"], action_scale=3.0, saturation="clip")
     env = TransformedEnv(GymEnv("HalfCheetah-v5"), Compose(*(make() for make in before), transform))
     env.set_seed(0)
     data = env.rollout(20)

@@ -170,7 +170,7 @@ def test_a_sequence_of_actions_is_mapped_one_by_one():
 
 def test_a_map_without_context_maps_a_sequence_of_actuations():
     map = SVD(3, 2)
-    env = TransformedEnv(ToyArm((3,)), Compose(MultiAction(), ActionMapTransform(map)))
+    env = TransformedEnv(ToyArm((3,)), Compose(MultiAction(), ActionMapTransform(map, saturation="clip")))
     observed = env.reset()
     start = observed["joint"].clone()
     actions = torch.rand(3, 3, 2) * 2 - 1

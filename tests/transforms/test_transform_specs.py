@@ -138,7 +138,7 @@ def test_keys_and_scale_default_to_the_maps_own(tmp_path):
 @pytest.mark.parametrize("map", [SVD(3, 2), Identity(3)], ids=lambda map: type(map).__name__)
 @pytest.mark.parametrize("keys", [None, ()])
 def test_a_map_without_context_needs_no_snapshot(map, keys):
-    env = TransformedEnv(ToyArm((3,)), ActionMapTransform(map, keys, action_scale=SCALE))
+    env = TransformedEnv(ToyArm((3,)), ActionMapTransform(map, keys, action_scale=SCALE, saturation="clip"))
     check_env_specs(env)
     data = env.rollout(10)
     assert "context" not in env.observation_spec
@@ -176,6 +176,7 @@ def test_dimensions_between_the_batchs_and_the_last(rows):
     transform = ActionMapTransform(
         NHT(3, 3, 2, hidden=(8,)),
         [("team", "joint")],
+        saturation="clip",
         action_key=("team", "action"),
         actuation_key=("team", "motor"),
         context_key=("team", "context"),
@@ -269,7 +270,7 @@ def test_copies_and_pickles(copied):
 
 
 def test_state_dict_holds_map_and_scale_whether_attached_or_not():
-    other = ActionMapTransform(NHT(5, 3, 2, hidden=(8,), seed=1), CONTEXT_KEYS)
+    other = ActionMapTransform(NHT(5, 3, 2, hidden=(8,), seed=1), CONTEXT_KEYS, saturation="clip")
     state = mapped_arm((3,)).state_dict()
     assert state.keys() == other.state_dict().keys()
     other.load_state_dict(state)
