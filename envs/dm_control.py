@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +48,10 @@ def suite_module(domain: str) -> Any:
         ImportError: if dm_control is not installed; the message says how to.
     """
     try:
-        from dm_control import suite
+        with warnings.catch_warnings():
+            # It looks for a window system at once, and GLFW complains where there is none.
+            warnings.filterwarnings("ignore", message=".*(DISPLAY|GLFW)", module="glfw")
+            from dm_control import suite
     except ImportError as error:
         raise ImportError("tasks of dm_control need its package: pip install 'nht[dm_control]'.") from error
     return getattr(suite, domain)
