@@ -32,7 +32,7 @@ EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, Runt
 """Errors that say by themselves what is wrong; HYDRA_FULL_ERROR=1 shows where they come from."""
 
 PATIENCE, TURN = 10.0, 2.0
-"""Seconds for which a process that torchrun started lets the first one speak, and as many more for each of lower rank."""
+"""Seconds for which a process that torchrun started lets the first one speak, and more for each before it."""
 
 
 def launch(

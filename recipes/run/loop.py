@@ -24,14 +24,14 @@ from nht.recipes.run.folder import VIDEO_FILE, RunFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
 from nht.recipes.run.video import record_video
-from nht.recipes.run.workers import WorkerEnded, Workers
+from nht.recipes.run.workers import WorkerEndedError, Workers
 
 VIDEO_EPISODES = 3
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 """What tells a run to end: after a last checkpoint."""
 ECHO = 3.0
-"""Seconds within which a second signal is the first one's echo: ``timeout`` sends it to the process and to its group, and
-torchrun hands it on."""
+"""Seconds within which a second signal is the first one's echo: ``timeout`` sends it to the process and to its group,
+and torchrun hands it on."""
 
 
 class Loop:
@@ -109,7 +109,7 @@ class Loop:
             FileNotFoundError: if there is nothing to go on from.
             ValueError: if the run was made by another number of processes.
             OSError: if there is no room for a checkpoint; earlier ones stay as they are.
-            WorkerEnded: after a last checkpoint, if a worker has died.
+            WorkerEndedError: after a last checkpoint, if a worker has died.
             SystemExit: after the last checkpoint, if the process was told to end.
         """
         before: dict[int, Any] = {}
@@ -175,10 +175,10 @@ class Loop:
         """Between two batches: if a worker dies, a last checkpoint is written."""
         try:
             yield
-        except WorkerEnded as error:
+        except WorkerEndedError as error:
             if self._record.frames:
                 self._checkpoints.save(self._record.frames)
-            raise WorkerEnded(f"{error} Go on with run.resume=auto.") from error
+            raise WorkerEndedError(f"{error} Go on with run.resume=auto.") from error
 
     def _save_if_due(self) -> None:
         stopping = self._ranks.any(self._signal is not None)

@@ -23,7 +23,7 @@ LAG = 2.0
 """Seconds within which a worker whose pipe has broken is seen to have ended."""
 
 
-class WorkerEnded(RuntimeError):
+class WorkerEndedError(RuntimeError):
     """A worker of a collector has ended by itself or was killed."""
 
 
@@ -48,7 +48,7 @@ class Workers:
         """The next batch.
 
         Raises:
-            WorkerEnded: if a worker has ended; all are killed then.
+            WorkerEndedError: if a worker has ended; all are killed then.
         """
         batch: TensorDictBase = self._call(lambda: next(self._batches))
         return batch
@@ -74,7 +74,7 @@ class Workers:
     def _look(self) -> None:
         for number, code in ended_workers(self._collector).items():
             kill_workers(self._collector)  # whoever waits for a lock of the dead one would not hear us
-            raise WorkerEnded(f"collector: worker {number} {_how(code)}.")
+            raise WorkerEndedError(f"collector: worker {number} {_how(code)}.")
 
     def _run(self, device: torch.device) -> None:
         if device.type == "cuda":
