@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
 from importlib.metadata import entry_points
@@ -30,6 +31,9 @@ NAMED: dict[str, Table[Any]] = {"env": TASKS, "map": KINDS}
 EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, RuntimeError)
 """Errors that say by themselves what is wrong; HYDRA_FULL_ERROR=1 shows where they come from."""
 
+PATIENCE, TURN = 10.0, 2.0
+"""Seconds for which a process that torchrun started lets the first one speak, and more for each before it."""
+
 
 def launch(
     main: Callable[[Config], object], schema: type[Config], name: str, positional: str | None = None
@@ -52,7 +56,25 @@ def launch(
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
+        _let_others_speak(error)
         sys.exit(f"error: {_message(error)}")
+
+
+def _let_others_speak(error: BaseException) -> None:
+    """Wait, so that what is wrong with all the processes that torchrun started is said once.
+
+    It ends all of them when the first to speak has ended; who is still there after a while is the only one to know.
+    That somebody else has gone is no news of one's own. Launchers that let the others live hear one line from each.
+    """
+    size, rank = (
+        int(os.environ.get(name, default)) for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"))
+    )
+    if size > 1 and (rank > 0 or _lost_another(error)):
+        time.sleep(PATIENCE + TURN * rank)
+
+
+def _lost_another(error: BaseException) -> bool:
+    return "gloo" in str(error) or type(error).__module__.startswith("torch.distributed")
 
 
 def _message(error: BaseException) -> str:

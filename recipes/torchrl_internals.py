@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -42,6 +43,26 @@ def carrier(collector: Collector) -> TensorDictBase:
     """What the next step of a collector starts from, observation and state of the exploration: ``_carrier``."""
     found: TensorDictBase = collector._carrier
     return found
+
+
+def ended_workers(collector: BaseCollector) -> dict[int, int]:
+    """The workers of a parallel collector that have ended, by number, with their exit codes.
+
+    Relies on ``procs``, the workers' processes in order; TorchRL closes the others of one that it finds dead.
+    """
+    ended = {}
+    for number, process in enumerate(collector.procs):
+        with contextlib.suppress(ValueError):  # a closed one
+            if not process.is_alive():
+                ended[number] = process.exitcode
+    return ended
+
+
+def kill_workers(collector: BaseCollector) -> None:
+    """End all workers of a parallel collector at once: ``procs``."""
+    for process in collector.procs:
+        with contextlib.suppress(ValueError):
+            process.kill()
 
 
 def followed_pairs(updater: SoftUpdate) -> Iterator[tuple[Tensor, Tensor]]:

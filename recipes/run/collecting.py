@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from typing import Any, Protocol, cast
 
@@ -11,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import BaseCollector, Collector, MultiSyncCollector
 from torchrl.envs import TransformedEnv
 
+from nht.recipes.run.parent import serve
 from nht.recipes.sections import CollectorConfig
 from nht.recipes.torchrl_internals import FirstComeCollector, carrier, count_frames_from, counted_frames
 
@@ -53,7 +55,8 @@ def make_collector(
     if config.kind == "single":
         return Collector(env, policy, **settings, track_traj_ids=False)
     makers = [
-        partial(_in_worker, make_env, worker_seed(seed, worker)) for worker in range(config.num_workers)
+        partial(_in_worker, make_env, worker_seed(seed, worker), os.getpid())
+        for worker in range(config.num_workers)
     ]
     if config.kind == "multi_sync":
         return MultiSyncCollector(makers, policy, **settings, cat_results=0)
@@ -72,7 +75,9 @@ def worker_seed(seed: int, *place: int) -> int:
     return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0])
 
 
-def _in_worker(make_env: MakeEnv, seed: int) -> TransformedEnv:
+def _in_worker(make_env: MakeEnv, seed: int, parent: int) -> TransformedEnv:
+    if os.getpid() != parent:
+        serve(parent)
     torch.set_num_threads(1)
     torch.manual_seed(seed)  # of this process: the exploration noise
     return make_env(seed=seed)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -22,10 +24,14 @@ from nht.recipes.run.folder import VIDEO_FILE, RunFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
 from nht.recipes.run.video import record_video
+from nht.recipes.run.workers import WorkerEndedError, Workers
 
 VIDEO_EPISODES = 3
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 """What tells a run to end: after a last checkpoint."""
+ECHO = 3.0
+"""Seconds within which a second signal is the first one's echo: ``timeout`` sends it to the process and to its group,
+and torchrun hands it on."""
 
 
 class Loop:
@@ -62,6 +68,7 @@ class Loop:
         self._policy, self._loss = policy, loss
         self._every = config.run.checkpoint_every
         self._signal: int | None = None
+        self._told_at = 0.0  # by the clock that never goes back [s]
         ranks.part_ways(envs.seed)  # the networks are made, alike in all processes; exploration differs
         self.collector: BaseCollector = make_collector(
             config.collector,
@@ -102,6 +109,7 @@ class Loop:
             FileNotFoundError: if there is nothing to go on from.
             ValueError: if the run was made by another number of processes.
             OSError: if there is no room for a checkpoint; earlier ones stay as they are.
+            WorkerEndedError: after a last checkpoint, if a worker has died.
             SystemExit: after the last checkpoint, if the process was told to end.
         """
         before: dict[int, Any] = {}
@@ -139,16 +147,38 @@ class Loop:
         folder.rewind(self._record.frames)
 
     def _stop(self, number: int, _: Any) -> None:
-        self._signal = number
-        signal.signal(number, signal.SIG_DFL)  # the second one acts at once
+        now = time.monotonic()
+        if self._signal is None:
+            self._signal, self._told_at = number, now
+        elif now - self._told_at > ECHO:  # asked again
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
 
     def _batches(self) -> Iterator[TensorDictBase]:
-        batches = iter(self.collector)
+        if self._alone:
+            batches = iter(self.collector)
+            while not self._record.finished:
+                yield next(batches)
+                self._save_if_due()
+            return
+        workers = Workers(self.collector, self._ranks.device)
         while not self._record.finished:
-            yield next(batches)
-            if not self._alone:
-                self.collector.update_policy_weights_(self._policy)
+            with self._saving():
+                batch = workers.next()
+            yield batch
+            with self._saving():
+                workers.update(self._policy)
             self._save_if_due()
+
+    @contextmanager
+    def _saving(self) -> Iterator[None]:
+        """Between two batches: if a worker dies, a last checkpoint is written."""
+        try:
+            yield
+        except WorkerEndedError as error:
+            if self._record.frames:
+                self._checkpoints.save(self._record.frames)
+            raise WorkerEndedError(f"{error} Go on with run.resume=auto.") from error
 
     def _save_if_due(self) -> None:
         stopping = self._ranks.any(self._signal is not None)

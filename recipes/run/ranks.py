@@ -10,11 +10,17 @@ from torch import Tensor, distributed, nn
 from torch.distributed.distributed_c10d import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
+from nht.recipes.run.parent import end_with
+
+PATIENCE = 60.0
+"""Seconds that a rank has for a last checkpoint when torchrun has died."""
+
 
 class Ranks:
     """This process among its fellows: what they average, add up and agree on. Alone, all of that does nothing.
 
-    Every method is to be called by all ranks, in the same order.
+    Every method is to be called by all ranks, in the same order. When the process that started them, torchrun, is
+    killed, they are told to end as by SIGTERM: a job that is queued again shall not meet them.
 
     Args:
         device: of the tensors; gloo connects CPUs, nccl GPUs.
@@ -43,6 +49,7 @@ class Ranks:
         self.rank = int(os.environ.get("RANK", "0")) if self.size > 1 else 0
         if self.size == 1:
             return
+        end_with(os.getppid(), PATIENCE)
         if self.device.type == "cuda":
             self.device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
             torch.cuda.set_device(self.device)

@@ -1,11 +1,13 @@
 """Contracts with private parts of other libraries: what breaks in an upgrade is named here."""
 
 import inspect
+import signal
+from functools import partial
 
 import pytest
 import torch
 from hydra import initialize_config_module
-from torchrl.collectors import Collector, MultiAsyncCollector
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.objectives import SoftUpdate
 
 from nht.envs import make_env
@@ -14,7 +16,14 @@ from nht.recipes.config import DDPG
 from nht.recipes.hydra_internals import choices
 from nht.recipes.launch import configure
 from nht.recipes.torch_internals import lerp_all
-from nht.recipes.torchrl_internals import carrier, count_frames_from, counted_frames, followed_pairs
+from nht.recipes.torchrl_internals import (
+    carrier,
+    count_frames_from,
+    counted_frames,
+    ended_workers,
+    followed_pairs,
+    kill_workers,
+)
 
 
 def test_torchrl_counts_a_collectors_frames_in__frames_and_starts_from__carrier():
@@ -33,6 +42,24 @@ def test_torchrl_counts_a_collectors_frames_in__frames_and_starts_from__carrier(
 def test_torchrl_gives_a_workers_number_first_in__get_from_queue():
     source = inspect.getsource(MultiAsyncCollector._get_from_queue)
     assert "return idx, j, out" in source
+
+
+@pytest.mark.slow
+def test_torchrl_keeps_a_collectors_workers_in_procs():
+    env = partial(make_env, "half_cheetah", 1, seed=0)
+    collector = MultiSyncCollector([env, env], None, frames_per_batch=20, total_frames=-1, cat_results=0)
+    assert ended_workers(collector) == {}
+    collector.procs[1].kill()
+    collector.procs[1].join()
+    assert ended_workers(collector) == {1: -signal.SIGKILL}
+    kill_workers(collector)
+    collector.procs[0].join()
+    assert ended_workers(collector) == {0: -signal.SIGKILL, 1: -signal.SIGKILL}
+    collector.procs[0].close()
+    assert ended_workers(collector) == {1: -signal.SIGKILL}
+    kill_workers(collector)
+    collector.procs[1].close()
+    collector.shutdown()
 
 
 def test_torchrl_keeps_what_targets_follow_in__sources_and__targets():

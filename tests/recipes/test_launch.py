@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from nht.recipes.agents.sac import SAC
 from nht.recipes.agents.td3 import TD3
@@ -117,3 +118,30 @@ def test_the_command_line_prints_a_mistake_in_one_line(tmp_path):
     assert found.returncode == 1
     assert found.stderr.strip().splitlines()[-1].startswith("error: Could not override 'algo.gama'")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("rank", "error", "waits"),
+    [
+        ("0", ValueError("no."), False),
+        ("1", ValueError("no."), True),
+        ("0", RuntimeError("[gloo/transport/tcp/pair.cc:534] Connection closed by peer"), True),
+        ("0", torch.distributed.DistNetworkError("The client socket has timed out."), True),
+    ],
+)
+def test_ranks_let_the_first_one_speak(rank, error, waits, monkeypatch):
+    def fail(_):
+        raise error
+
+    slept = []
+    monkeypatch.setattr("time.sleep", slept.append)
+    monkeypatch.setattr(sys, "argv", ["ddpg"])
+    for name, value in {"WORLD_SIZE": "2", "RANK": rank}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit, match=f"error: {re.escape(str(error))}"):
+        launch(fail, DDPG, "ddpg")
+    assert len(slept) == waits
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    with pytest.raises(SystemExit):
+        launch(fail, DDPG, "ddpg")
+    assert len(slept) == (waits and 1)

@@ -2,6 +2,11 @@
 
 import multiprocessing
 import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import pandas
 import pytest
@@ -103,6 +108,82 @@ def test_a_run_with_workers_goes_on(kind, tmp_path):
     assert metrics["updates"].tolist() == [6, 12, 18, 24]
     with pytest.raises(ValueError, match=r"holds a run with collector\.kind=multi_.*sync"):
         train("ddpg", "single", tmp_path / "run", "algo.total_frames=1000", "run.resume=true")
+
+
+def workers_of(process):
+    """The processes that step a collector's copies, by their numbers."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(child) for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
+
+
+def kill_a_worker(process, workers):
+    os.kill(workers[-1], signal.SIGKILL)
+
+
+def tell_all_to_end(process, workers):
+    os.killpg(process.pid, signal.SIGTERM)
+
+
+def kill_the_parent(process, workers):
+    process.kill()
+
+
+def runs(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize(
+    ("attack", "code", "words"),
+    [
+        (kill_a_worker, 1, r"error: collector: worker 1 was killed by SIGKILL. Go on with run.resume=auto."),
+        (tell_all_to_end, 128 + signal.SIGTERM, "was told to end: go on with run.resume=true."),
+        (kill_the_parent, -signal.SIGKILL, ""),
+    ],
+)
+def test_attacked_a_run_with_workers_ends(kind, attack, code, words, tmp_path):
+    folder = tmp_path / "run"
+    told = tiny_runs.settings("ddpg", folder, "algo.total_frames=1000000", f"collector={kind}")
+    command = [sys.executable, "-m", "nht.recipes.ddpg", *told]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        wait_for(lambda: list(folder.glob("checkpoints/checkpoint-*")), process)
+        workers = workers_of(process)
+        frames = latest_checkpoint(folder)
+        attack(process, workers)
+        output, errors = process.communicate(timeout=60)
+    assert process.returncode == code, errors
+    assert "Traceback" not in errors
+    assert words in output + errors
+    assert sum(line.startswith("error:") for line in errors.splitlines()) == (code == 1)
+    if code > 0:
+        assert latest_checkpoint(folder) >= frames
+    wait_until(lambda: not any(map(runs, workers)))
+    assert len(workers) == 2
+
+
+def latest_checkpoint(folder):
+    return max(int(path.stem.split("-")[1]) for path in folder.glob("checkpoints/checkpoint-*"))
+
+
+def wait_until(condition):
+    until = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def wait_for(condition, process):
+    until = time.monotonic() + 200
+    while not condition():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < until
+        time.sleep(0.05)
 
 
 def test_seeds_of_workers_differ_and_repeat():

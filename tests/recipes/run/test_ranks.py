@@ -12,6 +12,7 @@ import pytest
 import torch
 import yaml
 
+import failing_ranks
 import tiny_runs
 import two_ranks
 from nht.recipes.run.ranks import Ranks
@@ -103,6 +104,52 @@ def ranks_of(process):
         if b"RANK" in variables:
             ranks[int(variables[b"RANK"])] = child
     return ranks
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attack", ["kill the launcher", "tell all to end"])
+def test_ranks_end_with_their_launcher_after_a_last_checkpoint(attack, tmp_path):
+    folder = tmp_path / "run"
+    with subprocess.Popen(
+        command("ddpg", folder, "algo.total_frames=1000000"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        wait_for(lambda: list(folder.glob("checkpoints/rank-1/checkpoint-*")), process)
+        ranks = ranks_of(process)
+        if attack == "kill the launcher":
+            process.kill()
+        else:
+            os.killpg(process.pid, signal.SIGTERM)
+        output, errors = process.communicate(timeout=60)  # to the end of the last one that can write there
+    assert len(ranks) == 2
+    assert "was told to end: go on with run.resume=true." in output, errors
+    for number in ranks.values():
+        assert not Path(f"/proc/{number}").exists() or " Z " in Path(f"/proc/{number}/stat").read_text()
+    latest = [
+        max(path.name for path in folder.glob(f"checkpoints/rank-{rank}/checkpoint-*")) for rank in (0, 1)
+    ]
+    assert latest[0] == latest[1]
+    steps = int(latest[0].split("-")[1].split(".")[0]) // 200 * 200 + 200
+    more = run("ddpg", folder, f"algo.total_frames={steps}", "run.resume=true")
+    assert more.returncode == 0, more.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("failing", "heard"), [("0 1", 0), ("1", 1)])
+def test_an_error_is_said_once(failing, heard):
+    process = subprocess.run(
+        [*TORCHRUN, failing_ranks.__file__],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        env=os.environ | {"FAILING": failing},
+    )
+    assert process.returncode != 0
+    said = [line for line in process.stderr.splitlines() if line.startswith("error: ")]
+    assert said == [f"error: rank {heard} has no luck."]
 
 
 @pytest.mark.slow

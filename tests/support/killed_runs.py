@@ -1,0 +1,51 @@
+"""Runs in processes that can be killed, and that start fast: forked from one that has imported everything."""
+
+import multiprocessing
+import os
+import time
+
+import tiny_runs
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["killed_runs", "nht.recipes.ddpg", "nht.recipes.ppo"])
+
+
+def train(algorithm, folder, overrides, barrier=None):
+    """What a process does; its words go to a file beside the run's folder."""
+    if barrier is not None:
+        barrier.wait()
+    log = os.open(folder.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    tiny_runs.train(algorithm, folder, "run.resume=auto", *overrides)
+
+
+def start(algorithm, folder, overrides, barrier=None):
+    """The process, started; it begins when as many as ``barrier`` is for have come there."""
+    process = CONTEXT.Process(target=train, args=(algorithm, folder, overrides, barrier))
+    process.start()
+    return process
+
+
+def finish(algorithm, folder, overrides):
+    """Let it run to its end; the seconds that took."""
+    began = time.monotonic()
+    process = start(algorithm, folder, overrides)
+    process.join()
+    assert process.exitcode == 0, words(folder)
+    return time.monotonic() - began
+
+
+def kill_after(seconds, algorithm, folder, overrides):
+    """Kill it then; whether it was still running."""
+    process = start(algorithm, folder, overrides)
+    process.join(seconds)
+    process.kill()
+    process.join()
+    assert process.exitcode in (0, -9), words(folder)
+    return process.exitcode != 0
+
+
+def words(folder):
+    """What the processes of a run have said."""
+    return folder.with_suffix(".log").read_text()
