@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import pandas
-from tqdm import tqdm
 
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import configure, launch
 from nht.recipes.maps.kinds import KINDS, MapKind, find_kind, tasks_with_arm
+from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.metrics import FRAMES
 from nht.recipes.run.ownership import claimed
 from nht.recipes.study.cluster import Cluster
@@ -188,7 +188,7 @@ def progress(jobs: Sequence[Job], folder: Path) -> Iterator[Callable[[Rows], Non
     """A bar over the runs of a stage."""
     stage = jobs[0].stage
     # The mean rate, not the latest: runs of one configuration end together, and configurations differ.
-    with tqdm(total=len(jobs), desc=f"{folder.name}, {stage}", unit="run", smoothing=0) as bar:
+    with progress_bar(len(jobs), f"{folder.name}, {stage}", "run", smoothing=0) as bar:
 
         def show(ended: Rows) -> None:
             own = [ended[job.name] for job in jobs if job.name in ended]
@@ -197,7 +197,7 @@ def progress(jobs: Sequence[Job], folder: Path) -> Iterator[Callable[[Rows], Non
             if bar.n == 0:
                 bar.initial = len(own)  # what was there says nothing about the rate
             bar.update(len(own) - bar.n)
-            bar.set_postfix(failed=failed, running=running)  # drawn at once, also right after the start
+            show_beside(bar, failed=failed, running=running)
 
         yield show
 
