@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import pandas
 
@@ -23,13 +23,15 @@ from nht.recipes.maps.kinds import KINDS, MapKind, find_kind, tasks_with_arm
 from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.metrics import FRAMES
 from nht.recipes.run.ownership import claimed
-from nht.recipes.study.cluster import Cluster
 from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
 from nht.recipes.study.report import summary
 from nht.recipes.study.results import SearchResults, read_results
 from nht.recipes.study.rows_file import COLUMNS
 from nht.recipes.study.space import draw, write_manifest
 from nht.storage import replacing
+
+if TYPE_CHECKING:
+    from nht.recipes.study.cluster import Cluster
 
 FRESH = 100
 """First seed of the runs of best configurations: the search's own count from 0."""
@@ -45,6 +47,8 @@ def main(config: Search) -> None:
     demos = Path(config.demos.path or folder / "demos").resolve()
     jobs = search_jobs(search, demos)
     check_settings(jobs, folder)
+    from nht.recipes.study.cluster import Cluster  # Ray is an extra of its own
+
     write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
         if config.demos.path is None:
