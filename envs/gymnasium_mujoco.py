@@ -41,7 +41,7 @@ def make_gymnasium(
         options: further arguments of ``gymnasium.make``.
 
     Raises:
-        ImportError: if the environment is one of Gymnasium-Robotics, which is not installed.
+        ImportError: if the environment is one of Gymnasium-Robotics, which is not installed, or needs another package.
         KeyError: if a reset's ``info`` lacks one of the ``info_keys``.
         ValueError: for an id that does not exist, with some that do; for actions or observations of other kinds.
     """
@@ -71,7 +71,13 @@ def _register_robotics(needed: bool) -> None:
 
 
 def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> EnvBase:
-    env = GymEnv(name, **options)
+    try:
+        env = GymEnv(name, **options)
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"{name} needs {error.name}, which is not installed; Gymnasium's own MuJoCo tasks: "
+            "pip install 'gymnasium[mujoco]'."
+        ) from error
     copy = gymnasium_copy(env)
     drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
         "render_modes", []

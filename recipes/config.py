@@ -45,8 +45,8 @@ class CollectDemos:
     env: EnvConfig = field(default_factory=EnvConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
     source: SourceConfig = field(default_factory=SourceConfig)
-    seed: int = 0
-    out: str = path_field("")
+    seed: int = 0  # of every random draw
+    out: str = path_field("")  # folder of the demonstrations; never overwritten
 
 
 @dataclass
@@ -66,10 +66,10 @@ class TrainMap:
     demos: DemosConfig = field(default_factory=DemosConfig)
     map: MapConfig = field(default_factory=MapConfig)
     align: str | None = None  # tool: action axis 1 moves the arm's tool along x, 2 along y, 3 along z
-    seed: int = 0
-    device: str = "cpu"
-    torch_threads: int = 1
-    out: str = path_field("")
+    seed: int = 0  # of the weights, batches and held-out episodes
+    device: str = "cpu"  # where it is trained: cpu, cuda or cuda:1
+    torch_threads: int = 1  # on cores that others use, too, one is often fastest
+    out: str = path_field("")  # file of the map; never overwritten
 
     def __post_init__(self) -> None:
         """Raise ValueError for an alignment that does not exist."""
@@ -82,10 +82,10 @@ class Evaluate:
     """``python -m nht.recipes.evaluate``."""
 
     run: str = path_field("")  # folder of a finished run
-    episodes: int = 100
-    seed: int = 1_000_000
-    video: bool = True
-    video_episodes: int = 6
+    episodes: int = 100  # to test on
+    seed: int = 1_000_000  # of the test episodes
+    video: bool = True  # film some of them
+    video_episodes: int = 6  # how many
     env_options: dict[str, Any] = field(default_factory=dict)  # laid over those of the run
     allow: list[str] = field(default_factory=list)  # packages whose code a run's configuration may name
 
@@ -97,28 +97,28 @@ class CompareMaps:
     env: EnvConfig = field(default_factory=EnvConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
     map: MapConfig = field(default_factory=MapConfig)  # what all maps have in common
-    maps: list[str] = field(default_factory=lambda: ["nht", "laser", "svd", "scl"])
-    action_dims: list[int] = field(default_factory=lambda: [1, 2, 3])
-    seed: int = 0
-    torch_threads: int = 1
-    out: str = path_field("")
+    maps: list[str] = field(default_factory=lambda: ["nht", "laser", "svd", "scl"])  # kinds to compare
+    action_dims: list[int] = field(default_factory=lambda: [1, 2, 3])  # with so many action axes each
+    seed: int = 0  # of the weights, batches and held-out episodes
+    torch_threads: int = 1  # on cores that others use, too, one is often fastest
+    out: str = path_field("")  # folder of tables, figures and maps; never overwritten
 
 
 @dataclass
 class SearchConfig:
     """What is searched: interfaces x configurations x seeds, each a run of a recipe."""
 
-    recipe: str = "ddpg"
-    env: str = "wam_wipe"
+    recipe: str = "ddpg"  # that every run is of: ddpg, td3, sac, ppo or another algorithm
+    env: str = "wam_wipe"  # choice of the task
     action_dim: int = 2  # of learned maps
     metric: str = "success"  # or return: of a run's last evaluation
     interfaces: list[str] = field(default_factory=list)  # kinds of maps; raw is the actuation itself
-    configs: int = 128
-    seeds: int = 5
+    configs: int = 128  # drawn for each interface
+    seeds: int = 5  # runs of each configuration
     seed: int = 0  # of the draw
-    total_frames: int = 1_000_000
+    total_frames: int = 1_000_000  # environment steps of a run
     best_seeds: int = 5  # fresh ones, on which the best configuration of each interface is run again
-    best_frames: int = 1_000_000
+    best_frames: int = 1_000_000  # environment steps of those runs
     base: list[str] = field(default_factory=list)  # what every run is told, as on the recipe's command line
     space: dict[str, Any] = field(default_factory=dict)  # see recipes/study/space.py
 
@@ -150,9 +150,10 @@ class Report:
     """``python -m nht.recipes.report DIR``."""
 
     folder: str = path_field("")  # of a search, or of runs
-    runs: list[str] = field(default_factory=list)  # folders of runs, or folders that hold them
+    # folders of runs, or folders that hold them
+    runs: list[str] = field(default_factory=list, metadata={"path": True})
     out: str = path_field("")  # "" is a folder called report in the first of these
-    title: str = ""
+    title: str = ""  # of figures and page; "" is what they show
     metric: str = "success"  # or return: what the table and the curves show of every evaluation
     lines: str = "interface"  # or algorithm: what is compared in a table and a figure
 
@@ -170,7 +171,9 @@ class ExportMap:
     file: str = path_field("")  # a saved map
     out: str = path_field("")  # name.onnx or name.pt2; replaced if it exists
     action_scale: float | None = None  # what an action of 1 is worth; None is what the map says
-    low: list[float] | None = None  # of each motor: then the program saturates as the map does; None is no limit
+    low: list[float] | None = (
+        None  # of each motor: then the program saturates as the map does; None is no limit
+    )
     high: list[float] | None = None
     compiled: bool = False  # .pt2 only: machine code, for C++
     allow: list[str] = field(default_factory=list)  # packages whose classes the file may name

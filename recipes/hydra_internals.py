@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
 
@@ -13,9 +13,14 @@ def choices(group: str) -> list[str]:
 
 
 def reason(error: HydraException | OmegaConfBaseException) -> str:
-    """Why Hydra refused, in a line: the first line of its message, and of the cause's."""
-    cause = str(error.__cause__ or error).splitlines()[0]
-    return f"{str(error).splitlines()[0]} ({cause})"
+    """Why Hydra refused, in a line: the first line of its message, and of the cause's.
+
+    What cannot be read, ``OverrideParseException.override``, is named instead of the grammar's rules.
+    """
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} cannot be read"
+    first, cause = str(error).splitlines()[0], str(error.__cause__ or error).splitlines()[0]
+    return first if first == cause else f"{first} ({cause})"
 
 
 def unknown_key(error: HydraException | OmegaConfBaseException) -> str | None:

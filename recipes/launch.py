@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,8 +19,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nht.envs import TASKS
 from nht.envs.table import Table
+from nht.recipes.agents.table import ALGORITHMS
+from nht.recipes.help import help_text
 from nht.recipes.hydra_internals import choices, listed_choices, reason, unknown_key
 from nht.recipes.maps.kinds import KINDS
+from nht.recipes.overrides import as_text, check_flags, check_single, keyed, quoted, rule_for, section
+from nht.recipes.quiet import quiet_libraries
 from nht.recipes.sections import Training
 
 Config = TypeVar("Config")
@@ -46,13 +49,15 @@ def launch(
         name: YAML file under ``configs/`` that holds the recipe's values; a recipe may do without.
         positional: setting that a word without a key sets: ``PATH`` is short for ``positional=PATH``.
     """
-    arguments = sys.argv[1:] if positional is None else [_keyed(word, positional) for word in sys.argv[1:]]
-    if {"-h", "--help"} & set(arguments):
-        print(f"{(schema.__doc__ or '').strip()}\n\nValues, each of which `key=value` overrides:\n")
-        print(OmegaConf.to_yaml(_compose(schema, name, [])))
-        return
+    quiet_libraries()
     try:
-        main(configure(schema, name, arguments))
+        words = sys.argv[1:]
+        if positional is not None:
+            words = [_keyed(word, positional, schema) for word in words]
+        if {"-h", "--help"} & set(words):
+            print(_help(main, schema, name, [word for word in words if word not in ("-h", "--help")]))
+        else:
+            main(configure(schema, name, words))
     except EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
@@ -81,50 +86,10 @@ def _message(error: BaseException) -> str:
     return str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
 
 
-def _keyed(word: str, positional: str) -> str:
-    """A word of the command line as a Hydra override; a path may hold any character, an equals sign included."""
-    key, equals, _ = word.partition("=")
-    if word.startswith("-") or (
-        equals and re.fullmatch(r"[+~]{0,2}[A-Za-z_][\w./@]*", key) and "/" not in key
-    ):
-        return word
-    return f"{positional}={_quoted(word)}"
-
-
-def _quoted(text: str) -> str:
-    escaped = re.sub(r"(\\+)(?='|$)", r"\1\1", text).replace("'", r"\'")
-    return f"'{escaped}'"
-
-
-def _as_text(schema: type[Any], word: str) -> str:
-    """An override with its value quoted if it is text, as titles and paths are: these may hold commas and the like."""
-    key, equals, value = word.partition("=")
-    if not equals or _is_quoted(value):
-        return word
-    kind = _type(schema, key.lstrip("+"))
-    is_text = kind == "str" or (kind == "str | None" and value != "null")
-    return f"{key}={_quoted(value)}" if is_text else word
-
-
-def _is_quoted(value: str) -> bool:
-    return len(value) > 1 and value[0] == value[-1] and value[0] in ("'", '"')
-
-
-def _type(schema: type[Any], key: str) -> str | None:
-    """The type of the field at a dotted name, as it is written there."""
-    node: Any = schema
-    *outer, last = key.split(".")
-    for part in outer:
-        node = next((_section(entry) for entry in fields(node) if entry.name == part), None)
-        if node is None:
-            return None
-    return next((str(entry.type) for entry in fields(node) if entry.name == last), None)
-
-
-def _section(entry: Any) -> Any:
-    """The dataclass that a field holds, if it holds one."""
-    made = entry.default_factory() if callable(entry.default_factory) else None
-    return type(made) if is_dataclass(made) else None
+def _keyed(word: str, positional: str, schema: type[Any] | None = None) -> str:
+    """A word of the command line as a Hydra override; what has no key sets ``positional``."""
+    names = [entry.name for entry in fields(schema)] if schema is not None else []
+    return keyed(word, positional, names, os.path.lexists(Path(word).expanduser()))
 
 
 def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) -> Config:
@@ -138,16 +103,72 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
     Raises:
         ValueError: for an unknown key or choice, or a value of a wrong type; the message lists what exists.
     """
-    if flags := [word for word in overrides if word.startswith("-")]:
-        raise ValueError(
-            f"unknown flag {flags[0]!r}: settings are written key=value. "
-            "Hydra's multirun (-m) is not supported: start one process for each run."
-        )
+    composed = _told(schema, name, overrides)
     try:
-        texts = [_as_text(schema, word) for word in _named(schema, overrides)]
-        return cast(Config, _at_home(OmegaConf.to_object(_compose(schema, name, texts))))
+        return cast(Config, _at_home(OmegaConf.to_object(composed)))
+    except OmegaConfBaseException as error:
+        raise _mistake(schema, error, overrides) from error
+
+
+def _told(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
+    """What the command line says, laid over the recipe's values."""
+    check_flags(overrides, name)
+    texts = [as_text(schema, word) for word in _named(schema, overrides)]
+    check_single(schema, texts, name)
+    _check_algorithm(schema, overrides)
+    try:
+        return _compose(schema, name, texts)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ValueError(f"{reason(error)}{_existing(schema, error)}") from error
+        raise _mistake(schema, error, texts) from error
+
+
+def _mistake(
+    schema: type[Any], error: HydraException | OmegaConfBaseException, words: Sequence[str]
+) -> ValueError:
+    rule = rule_for(error, words)
+    return ValueError(f"{reason(error)}. {rule}" if rule else f"{reason(error)}{_existing(schema, error)}")
+
+
+def _help(main: Callable[..., object], schema: type[Any], name: str, overrides: Sequence[str]) -> str:
+    values = OmegaConf.to_container(_told(schema, name, overrides))
+    about = sys.modules[main.__module__].__doc__ or main.__doc__ or ""
+    return help_text(about, name, schema, cast(dict[str, Any], values), _choices(schema, name))
+
+
+def _choices(schema: type[Any], name: str) -> dict[str, list[str]]:
+    """The choices of each group that a recipe has: our YAML files, and what stands in tables."""
+    found: dict[str, list[str]] = {}
+    with initialize_config_module("nht.configs", version_base="1.3"):
+        for entry in fields(schema):
+            if section(entry) is None or not (names := choices(entry.name)):
+                continue
+            known = set(names) - {"named"} | set(NAMED.get(entry.name, ()))
+            if entry.name == "algo":
+                known = {choice for choice in known if _owner(choice) in (None, name)}
+            if not known:
+                continue
+            paths = ["or an import path, package.module:Name"] if entry.name in NAMED else []
+            found[entry.name] = sorted(known) + paths
+    return found
+
+
+def _owner(choice: str) -> str | None:
+    """The algorithm that a choice of ``algo`` is of: ``ddpg`` of ``ddpg_paper``."""
+    return next((name for name in ALGORITHMS if choice == name or choice.startswith(f"{name}_")), None)
+
+
+def _check_algorithm(schema: type[Any], overrides: Sequence[str]) -> None:
+    """Raise ValueError for a choice of another recipe's algorithm, whose settings mean other things."""
+    own = next((section(entry) for entry in fields(schema) if entry.name == "algo"), None)
+    for word in overrides:
+        key, _, choice = word.partition("=")
+        if own is None or key != "algo" or (owner := _owner(choice)) is None:
+            continue
+        algorithm = ALGORITHMS[owner]
+        theirs = next(section(entry) for entry in fields(algorithm.schema) if entry.name == "algo")
+        if not issubclass(own, theirs):
+            recipe = algorithm.main.partition(":")[0]
+            raise ValueError(f"{word} is a choice of another recipe: python -m {recipe} {word}.")
 
 
 def _named(schema: type[Any], overrides: Sequence[str]) -> Iterator[str]:
@@ -160,7 +181,7 @@ def _named(schema: type[Any], overrides: Sequence[str]) -> Iterator[str]:
         elif value in known and not _has_yaml(key, value):
             if key == "env":
                 yield "env=named"
-            yield f"{key}.{'name' if key == 'env' else 'kind'}={_quoted(value)}"
+            yield f"{key}.{'name' if key == 'env' else 'kind'}={quoted(value)}"
         else:
             yield word
 
@@ -177,8 +198,9 @@ def _at_home(config: Any) -> Any:
         value = getattr(config, entry.name)
         if is_dataclass(value):
             _at_home(value)
-        elif entry.metadata.get("path") and isinstance(value, str) and value.startswith("~"):
-            setattr(config, entry.name, str(Path(value).expanduser()))
+        elif entry.metadata.get("path"):
+            at_home = [os.path.expanduser(path) for path in value] if isinstance(value, list) else value
+            setattr(config, entry.name, os.path.expanduser(value) if isinstance(value, str) else at_home)
     return replace(config, **changed) if changed else config
 
 

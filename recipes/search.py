@@ -11,25 +11,27 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import pandas
-from tqdm import tqdm
 
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import configure, launch
 from nht.recipes.maps.kinds import KINDS, MapKind, find_kind, tasks_with_arm
+from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.metrics import FRAMES
 from nht.recipes.run.ownership import claimed
-from nht.recipes.study.cluster import Cluster
 from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
 from nht.recipes.study.report import summary
 from nht.recipes.study.results import SearchResults, read_results
 from nht.recipes.study.rows_file import COLUMNS
 from nht.recipes.study.space import draw, write_manifest
 from nht.storage import replacing
+
+if TYPE_CHECKING:
+    from nht.recipes.study.cluster import Cluster
 
 FRESH = 100
 """First seed of the runs of best configurations: the search's own count from 0."""
@@ -45,6 +47,8 @@ def main(config: Search) -> None:
     demos = Path(config.demos.path or folder / "demos").resolve()
     jobs = search_jobs(search, demos)
     check_settings(jobs, folder)
+    from nht.recipes.study.cluster import Cluster  # Ray is an extra of its own
+
     write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
         if config.demos.path is None:
@@ -188,7 +192,7 @@ def progress(jobs: Sequence[Job], folder: Path) -> Iterator[Callable[[Rows], Non
     """A bar over the runs of a stage."""
     stage = jobs[0].stage
     # The mean rate, not the latest: runs of one configuration end together, and configurations differ.
-    with tqdm(total=len(jobs), desc=f"{folder.name}, {stage}", unit="run", smoothing=0) as bar:
+    with progress_bar(len(jobs), f"{folder.name}, {stage}", "run", smoothing=0) as bar:
 
         def show(ended: Rows) -> None:
             own = [ended[job.name] for job in jobs if job.name in ended]
@@ -197,7 +201,7 @@ def progress(jobs: Sequence[Job], folder: Path) -> Iterator[Callable[[Rows], Non
             if bar.n == 0:
                 bar.initial = len(own)  # what was there says nothing about the rate
             bar.update(len(own) - bar.n)
-            bar.set_postfix(failed=failed, running=running)  # drawn at once, also right after the start
+            show_beside(bar, failed=failed, running=running)
 
         yield show
 

@@ -26,16 +26,24 @@ class EnvConfig:
     suite: str = "nht"  # whose task it is: nht, dm_control, gymnasium or torchrl
     context_keys: list[str] | None = None  # what a map sees, in order; None is what the task says
     num_envs: int | None = None  # copies; None is what the algorithm says
-    num_threads: int = 1
+    num_threads: int = 1  # native threads that share the copies of a task of ours
     options: dict[str, Any] = field(default_factory=dict)  # of the task itself, in training and in evaluation
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a task without a name."""
+        if not self.name:
+            raise ValueError(
+                f"env.name must name a task of {self.suite}, for torchrl what makes it: "
+                "env.name=my_package.robots:make."
+            )
 
 
 @dataclass
 class DemosConfig:
     """Where demonstrations come from: a folder, or else the task's scripted expert."""
 
-    path: str | None = path_field(None)
-    transitions: int = 20_000
+    path: str | None = path_field(None)  # folder that collect_demos wrote; None asks the expert
+    transitions: int = 20_000  # how many the expert or policy gives, in whole episodes
     speed: float | None = None  # of the expert's tool [m/s]; None is its default
     max_episode_steps: int = 1_000  # a demonstration ends at success, long before
     min_return: float | None = None  # of an episode worth keeping
@@ -63,22 +71,22 @@ class MapConfig:
     file: str | None = path_field(None)  # a saved map; None trains one from the demonstrations
     allow: list[str] = field(default_factory=list)  # packages whose classes a map file may name
     args: dict[str, Any] = field(default_factory=dict)  # further arguments of the kind's own
-    action_dim: int = 2
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    activation: str = "tanh"
+    action_dim: int = 2  # k: how many numbers an action is
+    hidden: list[int] = field(default_factory=lambda: [256, 256])  # widths of the network's hidden layers
+    activation: str = "tanh"  # of the hidden layers: tanh, relu or sigmoid
     multi_head: bool = False  # nht: each reflection has a last hidden layer of its own
     offset: str = "none"  # nht, scl, svd: constant or contextual, the actuation of no action
     start: str = "svd"  # nht: training starts from the plane that SVD finds; or random
     lipschitz: float | None = None  # bound L on the whole map; None leaves it free
     lipschitz_per_layer: bool = False  # L bounds each layer instead, if there is a bound
-    learning_rate: float = 1e-3
-    batch_size: int = 256
-    max_steps: int = 6_000
+    learning_rate: float = 1e-3  # of the map's training
+    batch_size: int = 256  # transitions in a gradient step
+    max_steps: int = 6_000  # gradient steps, at most
     beta_kl: float = 1e-3  # laser: weight of the KL divergence of its latents
     beta_dynamics: float = 1e-3  # laser: weight of predicting the next context
     residual: float | None = None  # adds n corrections to the action, each worth this much actuation
     saturation: str | None = None  # at the motors' limits: scale or clip; None is what the map says
-    # What an action of 1 is worth: a number, null for the demonstrations' largest action, or what the kind says.
+    # what an action of 1 is worth: a number, null for the demonstrations' largest action, or what the kind says
     action_scale: Any = DEFAULT_SCALE
 
     def __post_init__(self) -> None:
@@ -106,8 +114,8 @@ class MapConfig:
 class AlgoConfig:
     """What every algorithm has: how many environment steps, and how many of them between two rounds of updates."""
 
-    total_frames: int = 100_000
-    frames_per_batch: int = 200
+    total_frames: int = 100_000  # environment steps of the whole run, of all copies together
+    frames_per_batch: int = 200  # environment steps between two rounds of updates
     num_envs: int = 10  # copies of the task that the settings were found with
     lasting_failures: bool = False  # a failure does not end an episode of training: it lasts
 
@@ -137,7 +145,7 @@ class EvaluationConfig:
     """Deterministic episodes on environments and seeds of their own."""
 
     every: int = 10_000  # frames between two evaluations
-    episodes: int = 100
+    episodes: int = 100  # in each, one copy of the task for every episode
     video: bool = True  # of the final policy
 
 
@@ -145,13 +153,13 @@ class EvaluationConfig:
 class RunConfig:
     """Where a run writes, and whether it goes on from what it finds there."""
 
-    folder: str = path_field("")
+    folder: str = path_field("")  # of this run alone
     resume: Any = False  # true, or auto: go on if the folder holds a run, else begin
     checkpoint_every: int = 50_000  # frames
-    wandb: bool = True
-    wandb_project: str = "nht"
-    wandb_group: str | None = None
-    wandb_job_type: str | None = None
+    wandb: bool = True  # also write a Weights and Biases run: offline, unless you have logged in
+    wandb_project: str = "nht"  # where it stands there
+    wandb_group: str | None = None  # and with which others
+    wandb_job_type: str | None = None  # and as what
 
     def __post_init__(self) -> None:
         """Raise ValueError for another way to resume."""
@@ -170,9 +178,9 @@ class Training:
     collector: CollectorConfig = field(default_factory=CollectorConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
-    seed: int = 0
-    device: str = "cpu"
-    torch_threads: int = 1
+    seed: int = 0  # of every random draw
+    device: str = "cpu"  # where networks and batches are: cpu, cuda or cuda:1
+    torch_threads: int = 1  # of each process
 
     def __post_init__(self) -> None:
         """Raise ValueError for settings that do not go together."""

@@ -31,8 +31,8 @@ class DDPGConfig(OffPolicyConfig):
     random_frames: int = 0
     gamma: float = 0.98
     polyak: float = 0.96
-    actor_learning_rate: float = 1e-3
-    critic_learning_rate: float = 1e-3
+    actor_learning_rate: float = 1e-3  # of Adam
+    critic_learning_rate: float = 1e-3  # of Adam
     target_update_every: int = 1  # gradient steps between two moves of the target networks
     action_l2: float = 0.05  # weight of the mean squared action in the actor's loss
     exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]

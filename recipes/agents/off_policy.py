@@ -39,13 +39,13 @@ class OffPolicyConfig(AlgoConfig):
     """Settings of algorithms with a replay buffer; the defaults are published practice for locomotion."""
 
     frames_per_batch: int = 100
-    updates_per_batch: int = 100
+    updates_per_batch: int = 100  # gradient steps after each batch of environment steps
     warmup_frames: int = 10_000  # collected before the first update
     random_frames: int = 10_000  # the first ones, whose actions are uniform
-    batch_size: int = 256
-    buffer_size: int = 1_000_000
-    hidden: list[int] = field(default_factory=lambda: [256, 256])
-    gamma: float = 0.99
+    batch_size: int = 256  # steps in a gradient step
+    buffer_size: int = 1_000_000  # steps that are kept, the latest
+    hidden: list[int] = field(default_factory=lambda: [256, 256])  # of the actor, and of each critic
+    gamma: float = 0.99  # discount of a step
     n_steps: int = 1  # rewards that a target adds up before it trusts the critics, within a collected batch
     polyak: float = 0.995  # share of the old target network that stays at each move
     pessimism: float = 0.8  # the critics start at this times the lowest return that is possible

@@ -28,21 +28,21 @@ class PPOConfig(AlgoConfig):
 
     total_frames: int = 1_003_520
     frames_per_batch: int = 2_048  # steps per update, of all copies together
-    num_envs: int = 16
+    num_envs: int = 16  # copies of the task that the settings were found with
     epochs: int = 10  # times that a batch is gone through
     minibatches: int = 16  # gradient steps in an epoch
     hidden: list[int] = field(default_factory=lambda: [256, 256])  # of the actor, and of the critic
     activation: str = "relu"  # or tanh
     initial_std: float = 0.135  # of the actions, of which the task sees those in [-1, 1]
-    learning_rate: float = 3e-4
+    learning_rate: float = 3e-4  # of Adam
     decay_learning_rate: bool = True  # linearly, to 0 at total_frames
-    gamma: float = 0.98
+    gamma: float = 0.98  # discount of a step
     lmbda: float = 0.92  # GAE's lambda
     clip: float = 0.1  # of the ratio of probabilities
     clip_value: bool = False  # holds the critic within clip of its old values, too
     critic_coeff: float = 0.58  # weight of the critic's mean squared error
-    entropy_coeff: float = 4e-4
-    max_grad_norm: float = 0.8
+    entropy_coeff: float = 4e-4  # weight of the entropy, which keeps actions various
+    max_grad_norm: float = 0.8  # a longer gradient is shortened to this
     observation_clip: float = 10.0  # of the normalised observation
     reward_clip: float = 10.0  # of the reward over the deviation of discounted returns
 

@@ -35,9 +35,9 @@ LOG_STD = (-10.0, 2.0)
 class SACConfig(OffPolicyConfig):
     """SAC's settings; the defaults are those that its authors publish for locomotion."""
 
-    actor_learning_rate: float = 3e-4
-    critic_learning_rate: float = 3e-4
-    temperature_learning_rate: float = 3e-4
+    actor_learning_rate: float = 3e-4  # of Adam
+    critic_learning_rate: float = 3e-4  # of Adam
+    temperature_learning_rate: float = 3e-4  # of Adam; 0 keeps the temperature
     initial_temperature: float = 1.0  # weight of the entropy, which is learned from here
     target_entropy: float | None = None  # of the policy; None is minus the number of actions
 

@@ -27,8 +27,8 @@ from nht.recipes.sections import Training
 class TD3Config(OffPolicyConfig):
     """TD3's settings; the defaults are those that its authors publish for locomotion."""
 
-    actor_learning_rate: float = 3e-4
-    critic_learning_rate: float = 3e-4
+    actor_learning_rate: float = 3e-4  # of Adam
+    critic_learning_rate: float = 3e-4  # of Adam
     policy_noise: float = 0.2  # standard deviation of what smooths the target's action
     noise_clip: float = 0.5  # largest absolute value of it
     policy_delay: int = 2  # updates of the critics for each of the actor and the target networks

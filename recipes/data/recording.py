@@ -10,12 +10,12 @@ from pathlib import Path
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 import nht
 from nht.envs import make_env, make_expert
 from nht.envs.registry import TASKS, find_task
 from nht.envs.task import BatchedTask
+from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig
 
 COPIES = 100
@@ -93,7 +93,7 @@ def record(
     steps: list[TensorDict] = []
     length = torch.zeros(simulation.batch_size, dtype=torch.int64)
     total, collected = torch.zeros(simulation.batch_size, dtype=torch.float64), 0
-    with tqdm(total=demos.transitions, desc="demonstrations", unit="step", unit_scale=True) as progress:
+    with progress_bar(demos.transitions, "demonstrations", "step", unit_scale=True) as progress:
         while collected < demos.transitions:
             stepped, current = simulation.step_and_maybe_reset(act(current))
             done, success = (stepped["next", flag].view(-1) for flag in ("done", "success"))

@@ -6,7 +6,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-from tqdm import tqdm
 
 import nht
 from nht.recipes.data.recording import record_expert
@@ -18,6 +17,7 @@ from nht.recipes.maps.kinds import (
     map_context_keys,
     tasks_with_arm,
 )
+from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig, Training
 from nht.storage import format_version
 
@@ -50,7 +50,7 @@ def train_map(
         untrained = make_map(map, context_dim, data.actuation.shape[-1], seed, env).to(device)
         if align is not None:
             _check_alignable(untrained, env.name)
-        with tqdm(total=map.max_steps, desc=f"map {map.kind}", unit="step", unit_scale=True) as bar:
+        with progress_bar(map.max_steps, f"map {map.kind}", "step", unit_scale=True) as bar:
 
             def show(metrics: dict[str, float]) -> None:
                 bar.set_postfix(error=f"{metrics['validation_error']:.2e}", refresh=False)

@@ -1,17 +1,21 @@
-"""A run on Weights and Biases: offline unless the user has logged in, and never needed for a run to work."""
+"""A run on Weights and Biases: offline unless the user has logged in, and never needed for a run to work.
+
+``wandb`` is imported where a run wants it, and nowhere else.
+"""
 
 from __future__ import annotations
 
 import os
-from dataclasses import asdict
+from collections.abc import Mapping
 from netrc import NetrcParseError, netrc
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 from urllib.parse import urlsplit
 
-import wandb
-
+from nht.reading import shortened
 from nht.recipes.run.metrics import FRAMES
-from nht.recipes.sections import Training
+from nht.recipes.sections import RunConfig
 
 SERVER = "https://api.wandb.ai"
 """W&B's own, unless ``WANDB_BASE_URL`` names another."""
@@ -22,24 +26,35 @@ class Dashboard:
 
     Args:
         folder: of the run.
-        config: its whole configuration; every key of it is found again in W&B.
+        settings: what is in its ``config.yaml``; every key of it is found again in W&B.
+        run: where it stands there.
         mode: ``online``, ``offline`` or ``shared``.
+
+    Raises:
+        ImportError: if ``wandb`` is not installed.
+        RuntimeError: if W&B does not start.
     """
 
-    def __init__(self, folder: Path, config: Training, mode: str) -> None:
+    def __init__(self, folder: Path, settings: Mapping[str, Any], run: RunConfig, mode: str) -> None:
         os.environ.setdefault("WANDB_SILENT", "true")
         if not os.environ.get("WANDB_API_KEY", "-"):
             del os.environ["WANDB_API_KEY"]  # empty, as compose files leave it: W&B would refuse to start
         self._folder = folder
-        self._run = wandb.init(
-            name=folder.name,
-            dir=str(folder),
-            project=config.run.wandb_project,
-            group=config.run.wandb_group,
-            job_type=config.run.wandb_job_type,
-            config=asdict(config),
-            mode=mode,  # type: ignore[arg-type]
-        )
+        self._wandb = wandb = import_wandb()
+        try:
+            self._run = wandb.init(
+                name=folder.name,
+                dir=str(folder),
+                project=run.wandb_project,
+                group=run.wandb_group,
+                job_type=run.wandb_job_type,
+                config=dict(settings),
+                mode=mode,
+            )
+        except (wandb.Error, ValueError) as error:
+            raise RuntimeError(
+                f"W&B does not start: {shortened(error)}. Set WANDB_MODE=offline, or run.wandb=false."
+            ) from error
 
     def log(self, frames: int, row: dict[str, float]) -> None:
         """A row of metrics, against environment steps."""
@@ -48,19 +63,46 @@ class Dashboard:
     def finish(self, map_file: Path, video: Path) -> None:
         """Hand over the map, and the video if there is one."""
         if video.exists():
-            self._run.log({"video": wandb.Video(str(video), format="mp4")})
-        artifact = wandb.Artifact(f"map-{self._folder.name}", type="action-map")
+            self._run.log({"video": self._wandb.Video(str(video), format="mp4")})
+        artifact = self._wandb.Artifact(f"map-{self._folder.name}", type="action-map")
         artifact.add_file(str(map_file))
         self._run.log_artifact(artifact)
         self._run.finish()
 
 
-def open_dashboard(folder: Path, config: Training) -> Dashboard | None:
-    """The run's dashboard; None where W&B is not wanted: ``run.wandb=false``, or ``WANDB_MODE=disabled``."""
-    mode = os.environ.get("WANDB_MODE") or ("online" if logged_in() else "offline")
-    if not config.run.wandb or mode == "disabled":
+def open_dashboard(folder: Path, settings: Mapping[str, Any], run: RunConfig) -> Dashboard | None:
+    """The run's dashboard; None where W&B is not ``wanted``. Arguments as of ``Dashboard``."""
+    if not wanted(run):
         return None
-    return Dashboard(folder, config, mode)
+    mode = os.environ.get("WANDB_MODE") or ("online" if logged_in() else "offline")
+    return Dashboard(folder, settings, run, mode)
+
+
+def wanted(run: RunConfig) -> bool:
+    """Whether a run is to be written for W&B: not with ``run.wandb=false``, nor with ``WANDB_MODE=disabled``.
+
+    Raises:
+        ImportError: if it is, and ``wandb`` is not installed.
+    """
+    if not run.wandb or os.environ.get("WANDB_MODE") == "disabled":
+        return False
+    import_wandb()
+    return True
+
+
+def import_wandb() -> ModuleType:
+    """The module ``wandb``.
+
+    Raises:
+        ImportError: if it is not installed; says how to do without.
+    """
+    try:
+        import wandb
+    except ImportError as error:
+        raise ImportError(
+            "run.wandb=true needs wandb: pip install 'nht[recipes]', or set run.wandb=false."
+        ) from error
+    return wandb
 
 
 def logged_in() -> bool:

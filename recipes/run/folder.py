@@ -24,7 +24,7 @@ from nht.recipes.agents.table import find_algorithm, name_of
 from nht.recipes.maps.interface import run_map
 from nht.recipes.maps.kinds import default_scale, find_kind, map_context_keys
 from nht.recipes.run.config_file import check_code, read_settings
-from nht.recipes.run.dashboard import Dashboard, open_dashboard
+from nht.recipes.run.dashboard import Dashboard, open_dashboard, wanted
 from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
 from nht.recipes.run.metrics_file import read_metrics
@@ -109,6 +109,7 @@ class RunFolder:
             )
         self._look()
         motors = check_env(self.config.env)
+        wanted(self.config.run)  # whether W&B is installed, if it is
         settings = self.path / CONFIG_FILE
         if not self.resuming:
             undo.callback(settings.unlink, missing_ok=True)
@@ -117,7 +118,7 @@ class RunFolder:
             map = run_map(self.config, motors)
             mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
             nht.save_map(map, kept)
-        self._dashboard = open_dashboard(self.path, self.config)
+        self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
 
     def _look(self) -> None:
         """Finds out whether a run is to go on here, and whether it may."""
@@ -154,10 +155,13 @@ class RunFolder:
             new = ", ".join(f"{name}={after[name]}" for name in changed)
             raise ValueError(f"{self.path} holds a run with {old}: it cannot go on with {new}.")
 
+    def _settings(self) -> dict[str, Any]:
+        """What ``config.yaml`` holds."""
+        return {"recipe": name_of(type(self.config)), **asdict(self.config)}
+
     def _write_config(self) -> None:
-        described = {"recipe": name_of(type(self.config)), **asdict(self.config)}
         with replacing(self.path / CONFIG_FILE) as scratch:
-            scratch.write_text(yaml.safe_dump(described, sort_keys=False))
+            scratch.write_text(yaml.safe_dump(self._settings(), sort_keys=False))
 
     @property
     def whole(self) -> bool:

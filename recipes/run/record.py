@@ -8,6 +8,7 @@ from typing import Any
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.evaluation import Evaluation
 from nht.recipes.run.folder import RunFolder
@@ -54,12 +55,12 @@ class Record:
 
     def show_progress(self) -> None:
         """Draw the bar, from where the run stands."""
-        self._bar = tqdm(
-            total=self._total,
-            initial=self.counters.frames,
-            desc=self._folder.path.name,
-            unit="step",
+        self._bar = progress_bar(
+            self._total,
+            self._folder.path.name,
+            "step",
             unit_scale=True,
+            initial=self.counters.frames,
             disable=not self._ranks.first,
         )
 
@@ -84,7 +85,7 @@ class Record:
         if row[tested(SUCCESS)] > 0:  # never, where a task has no notion of success
             shown[SUCCESS] = row[tested(SUCCESS)]
         if self._bar is not None:
-            self._bar.set_postfix(shown)
+            show_beside(self._bar, **shown)
 
     def close(self) -> None:
         """Leave the bar as it is."""

@@ -14,14 +14,18 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from nht.envs.simulation import Simulation
+from nht.recipes.progress_bar import progress_bar
 from nht.recipes.run.evaluation import Evaluation, Policy, evaluate
 
 Picture = NDArray[np.uint8]
 
 TILE = (480, 360)  # width and height of one copy's picture [pixel]
 SMOOTH = 30  # frames per second that are enough
+MOST_FRAMES = 300  # of a film; of longer episodes fewer steps are filmed
+JERKY = 15  # frames per second; a film that would have fewer because steps are left out runs faster than time
 TRAIL_EVERY = 4  # steps; each piece of a line costs time in software rendering
 SHEET_COLUMNS = 6  # moments of an episode on the contact sheet
+GAP = 40  # grey of a tile without a copy
 COLOURS = {"failed": (200, 40, 40), "success": (30, 150, 60), "": (120, 120, 120)}
 BORDER = 4  # pixels
 
@@ -30,7 +34,9 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
     """Write one episode of every copy of ``env`` as an MP4 at the speed of real time, and a contact sheet beside it.
 
     A copy's tile has a trail of the tool, where the task has one, the time, and a border that says how the episode
-    stands: green for success, red for failure. The tile of an episode that has ended stands still.
+    stands: green for success, red for failure. The tile of an episode that has ended stands still. Films have about
+    ``MOST_FRAMES`` pictures at most: of long episodes fewer steps are filmed, and the film may then run several times
+    as fast as time, which its tiles say.
 
     Args:
         env: a batched task behind any transforms.
@@ -43,7 +49,13 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
     film = Film(env.base_env.task)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        outcome = evaluate(env, policy, on_step=film.add)
+        with progress_bar(film.steps, "film", "step") as bar:
+
+            def watch(outcome: TensorDictBase) -> None:
+                film.add(outcome)
+                bar.update()
+
+            outcome = evaluate(env, policy, on_step=watch)
     finally:
         film.close()
     with imageio.get_writer(path, fps=film.frames_per_second, macro_block_size=8) as writer:
@@ -59,14 +71,20 @@ class Film:
 
     Attributes:
         frames: of every moment filmed, a picture ``(height, width, 3)`` per copy.
-        frames_per_second: at which the film runs at the speed of real time.
+        frames_per_second: at which the film runs at ``speed``.
+        speed: times that of real time.
+        steps: that it may see, the reset included.
     """
 
     def __init__(self, task: Simulation) -> None:
         self.frames: list[list[Picture]] = []
         steps_per_second = 1 / task.time_per_step
-        self._every = math.ceil(steps_per_second / SMOOTH)
-        self.frames_per_second = steps_per_second / self._every
+        smooth = math.ceil(steps_per_second / SMOOTH)
+        self.steps = task.max_episode_steps + 1
+        self._every = max(smooth, math.ceil(self.steps / MOST_FRAMES))
+        rate = steps_per_second / self._every
+        self.speed = max(1, math.ceil(JERKY / rate)) if self._every > smooth else 1
+        self.frames_per_second = rate * self.speed
         self._seconds_per_step = task.time_per_step
         self._renderer = task.renderer(*TILE)
         self._trail: list[NDArray[np.float64]] = []
@@ -94,7 +112,7 @@ class Film:
         draw.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=COLOURS[state], width=BORDER)
         draw.text(
             (12, 10),
-            f"{seconds:4.2f} s  {state}",
+            f"{seconds:4.2f} s  {f'{self.speed} x  ' if self.speed > 1 else ''}{state}",
             fill=(255, 255, 255),
             stroke_width=2,
             stroke_fill=(0, 0, 0),
@@ -108,10 +126,10 @@ class Film:
 
 
 def grid(tiles: list[Picture]) -> Picture:
-    """Pictures of one size side by side, in about as many rows as columns; white where there is none left."""
+    """Pictures of one size side by side, in about as many rows as columns; dark where there is none left."""
     columns = math.ceil(math.sqrt(len(tiles)))
     missing = -len(tiles) % columns
-    tiles = tiles + [np.full_like(tiles[0], 255)] * missing
+    tiles = tiles + [np.full_like(tiles[0], GAP)] * missing
     rows = [np.concatenate(tiles[start : start + columns], axis=1) for start in range(0, len(tiles), columns)]
     return np.concatenate(rows, axis=0)
 

@@ -163,7 +163,7 @@ def test_every_option_is_read(reads, tmp_path, monkeypatch):
     run(compare_maps, schemas.CompareMaps, "compare_maps", *compared)
     run(export_map, schemas.ExportMap, "export_map", "file=map.safetensors", "out=map.pt2")
     run(report, schemas.Report, "report", "folder=runs")
-    monkeypatch.setattr(search, "Cluster", InProcess)
+    monkeypatch.setattr("nht.recipes.study.cluster.Cluster", InProcess)
     monkeypatch.setattr(Algorithm, "train", lambda *_: None)
     told = ["search=smoke", "search.best_seeds=0", "demos.path=demos", "folder=search"]
     run(search, schemas.Search, "search", *told)

@@ -4,12 +4,24 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 import nht
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.evaluation import evaluate
-from nht.recipes.run.video import COLOURS, SHEET_COLUMNS, TILE, Film, contact_sheet, grid, record_video
+from nht.recipes.run.video import (
+    COLOURS,
+    GAP,
+    JERKY,
+    MOST_FRAMES,
+    SHEET_COLUMNS,
+    TILE,
+    Film,
+    contact_sheet,
+    grid,
+    record_video,
+)
 from nht.recipes.sections import EnvConfig
 
 STILL = TensorDictModule(lambda observation: torch.zeros(len(observation), 7), ["observation"], ["action"])
@@ -32,12 +44,12 @@ def tile(value):
     return np.full((4, 6, 3), value, dtype=np.uint8)
 
 
-def test_a_grid_has_about_as_many_rows_as_columns_and_white_gaps():
+def test_a_grid_has_about_as_many_rows_as_columns_and_dark_gaps():
     pictures = [tile(value) for value in range(5)]
     picture = grid(pictures)
     assert picture.shape == (8, 18, 3)
     assert [picture[0, 6 * i, 0] for i in range(3)] == [0, 1, 2]
-    assert [picture[4, 6 * i, 0] for i in range(3)] == [3, 4, 255]
+    assert [picture[4, 6 * i, 0] for i in range(3)] == [3, 4, GAP]
     assert grid([tile(7)]).shape == (4, 6, 3)
 
 
@@ -95,3 +107,42 @@ def test_watching_changes_nothing():
     plain = evaluate(wipe(), STILL)
     watched = evaluate(wipe(), STILL, on_step=lambda outcome: None)
     torch.testing.assert_close(plain.episode_return, watched.episode_return)
+
+
+class Drawn:
+    """Copies of which every picture is blank; drawing them is counted."""
+
+    num_envs, observation_sizes = 2, ()
+
+    def __init__(self, steps, time_per_step):
+        self.max_episode_steps, self.time_per_step, self.drawn = steps, time_per_step, 0
+
+    def renderer(self, width, height):
+        return self
+
+    def frame(self, row, trail):
+        self.drawn += 1
+        return np.zeros((24, 32, 3), dtype=np.uint8)
+
+
+def filmed(steps, time_per_step):
+    task = Drawn(steps, time_per_step)
+    film = Film(task)
+    for step in range(steps + 1):
+        flag = torch.full((2, 1), step == steps)
+        film.add(TensorDict({"done": flag, "success": ~flag & flag, "failure": ~flag & flag}, batch_size=2))
+    return film, task
+
+
+@pytest.mark.parametrize(
+    ("steps", "time_per_step", "speed"),
+    [(1_000, 0.05, 3), (1_000, 0.01, 1), (200, 0.04, 1), (100, 0.5, 1), (10_000, 0.05, 26)],
+)
+def test_films_of_long_episodes_are_short(steps, time_per_step, speed):
+    film, task = filmed(steps, time_per_step)
+    assert film.speed == speed
+    assert len(film.frames) <= MOST_FRAMES + 1  # the end is always filmed
+    assert task.drawn <= 2 * (MOST_FRAMES + 1)
+    assert film.frames_per_second >= min(JERKY, 1 / time_per_step)
+    seconds = steps * time_per_step / speed
+    assert len(film.frames) / film.frames_per_second == pytest.approx(seconds, rel=0.03)

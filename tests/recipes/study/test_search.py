@@ -58,7 +58,7 @@ class InProcess:
 @pytest.fixture
 def cluster(monkeypatch):
     cluster = InProcess()
-    monkeypatch.setattr(search, "Cluster", lambda *_: cluster)
+    monkeypatch.setattr(cluster_module, "Cluster", lambda *_: cluster)
     return cluster
 
 
