@@ -71,7 +71,7 @@ class BringBall(SuiteTask):
         self._lengths = np.array([model.body(name).pos[2] for name in LINKS])
         self._grasp = model.site("grasp").pos[2]
         self._depth = model.body("target_ball").pos[1] - model.body("ball").pos[1]
-        # The model's own target stands still: `decorate` draws one where it is.
+        # The model's own target stands still: ``decorate`` draws one where it is.
         model.geom("target_ball").matid = -1
         model.geom("target_ball").rgba = 0.0
         self._scratch = mujoco.MjData(model)

@@ -28,8 +28,8 @@ class ActionMap(nn.Module, ABC):
     context takes one all the same; its last dimension may then be 0. Tensors of another last dimension are refused by
     ``forward`` and ``project``, whatever class overrides them.
 
-    `forward` and `project` are in the map's own, raw units. A policy's action is one in [-1, 1]^k: `decode` makes an
-    actuation of it, `encode` is the way back. What 1 stands for, ``action_scale``, and what happens at the motors'
+    ``forward`` and ``project`` are in the map's own, raw units. A policy's action is one in [-1, 1]^k: ``decode`` makes
+    an actuation of it, ``encode`` is the way back. What 1 stands for, ``action_scale``, and what happens at the motors'
     limits, ``saturation``, belong to the map and stand in its file.
 
     A subclass is trained, saved and loaded like those of this package: what its constructor was given is remembered.
@@ -41,11 +41,11 @@ class ActionMap(nn.Module, ABC):
         context_keys: the entries that, side by side in this order, are the context. None until trained.
         data_fingerprint: which demonstrations it was trained on. None until trained.
         action_scale: buffer, scalar: what a policy's 1 stands for. Training sets it to the largest |a_i| of the
-            projected demonstrations, `set_action_scale` to anything else. 1 until then.
+            projected demonstrations, ``set_action_scale`` to anything else. 1 until then.
         actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
         actuation_high: buffer, (n,): the largest ones. infinity until trained.
         learns: whether demonstrations decide what the map does, not only its bounds.
-        needs_next_context: whether `loss` reads ("next", "context"), (batch, context_dim).
+        needs_next_context: whether ``loss`` reads ("next", "context"), (batch, context_dim).
     """
 
     learns = True
@@ -72,9 +72,9 @@ class ActionMap(nn.Module, ABC):
     def __init__(self, context_dim: int, actuation_dim: int, action_dim: int) -> None:
         super().__init__()
         if not 1 <= action_dim <= actuation_dim:
-            raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}")
+            raise ValueError(f"action_dim must be in 1 ... actuation_dim={actuation_dim}, got {action_dim}.")
         if context_dim < 0:
-            raise ValueError(f"context_dim must be 0 or more, got {context_dim}")
+            raise ValueError(f"context_dim must be 0 or more, got {context_dim}.")
         self.context_dim = operator.index(context_dim)
         self.actuation_dim = operator.index(actuation_dim)
         self.action_dim = operator.index(action_dim)
@@ -88,7 +88,7 @@ class ActionMap(nn.Module, ABC):
     def __setattr__(self, name: str, value: Any) -> None:
         """Lets a subclass have a layer called like one of the methods below, as many autoencoders do.
 
-        `forward` and `project` of the subclass then find the layer, and the method is ``type(map).encode(map, ...)``.
+        ``forward`` and ``project`` of the subclass then find the layer; the method is ``type(map).encode(map, ...)``.
         """
         super().__setattr__(name, value)
         if name in ("decode", "encode", "rest") and isinstance(value, nn.Module | nn.Parameter):
@@ -96,7 +96,7 @@ class ActionMap(nn.Module, ABC):
 
     @property
     def saturation(self) -> Saturation:
-        """What `decode` does at the motors' limits: ``"scale"`` or ``"clip"``, see `nht.saturation`."""
+        """What ``decode`` does at the motors' limits: ``"scale"`` or ``"clip"``, see ``nht.saturation``."""
         return self._saturation
 
     @saturation.setter
@@ -204,7 +204,7 @@ class ActionMap(nn.Module, ABC):
 
         Of an argument that is kept as an attribute of its own name this is the attribute, else what was given. Only
         numbers, text, None, lists and dictionaries of these, and other maps can stand in a file. What a constructor
-        takes by position alone, `init_positional` gives.
+        takes by position alone, ``init_positional`` gives.
         """
         return named_arguments(self, self._recorded_arguments)
 

@@ -44,7 +44,7 @@ def actuation_certificate(
 ) -> float:
     """A proven Lipschitz constant of actuations (Eq. 22): |u(c) - u(c')| <= it times |c - c'| for the same action.
 
-    It is that of `decode` with these limits and the map's saturation; without limits, that of the map itself.
+    It is that of ``decode`` with these limits and the map's saturation; without limits, that of the map itself.
 
     Args:
         map: any action map.
@@ -58,7 +58,7 @@ def actuation_certificate(
         not known to stay within the limits in all contexts.
 
     Raises:
-        ValueError: if `largest_action` is negative or NaN.
+        ValueError: if ``largest_action`` is negative or NaN.
     """
     if largest_action is None:
         largest_action = float(map.action_scale) * math.sqrt(map.action_dim)
@@ -79,7 +79,7 @@ def _stretch(map: ActionMap, largest_action: float, low: Tensor | None, high: Te
     down = -unlimited if low is None else torch.as_tensor(low).double().cpu().expand(map.actuation_dim)
     norm = _basis_norm(map)
     reach = norm * largest_action if largest_action else 0.0  # of |d|
-    # A facet is met no closer than `nearest`; beside it x may be as long as the other motors' largest rooms allow.
+    # A facet is met no closer than ``nearest``; beside it x may be as long as the other motors' largest rooms allow.
     longest = torch.maximum(up - least, most - down).square()
     largest = 1.0
     for nearest in (up - most, least - down):

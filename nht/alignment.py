@@ -4,6 +4,8 @@ What a basis spans is learned, its signs and its rotation within that span are l
 who steers by joystick does. A constant orthogonal matrix, found after training, puts it right.
 """
 
+from __future__ import annotations
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -18,10 +20,10 @@ class Aligned(LinearActionMap):
     """Another map with its axes turned or mirrored: u = u0(c) + Q(c) R a, with one orthogonal R for all contexts.
 
     What the map spans, its offset, its projection error, its orthonormal columns, its certificate: none of them
-    changes, for R changes no length. `action_scale` is taken over, too; as a largest entry, that of the turned actions
-    may be up to sqrt(k) times larger or smaller.
+    changes, for R changes no length. ``action_scale`` is taken over, too; as a largest entry, that of the turned
+    actions may be up to sqrt(k) times larger or smaller.
 
-    There is nothing to learn: wrap a trained map, or let `align` do so. Its context keys, bounds and fingerprint are
+    There is nothing to learn: wrap a trained map, or let ``align`` do so. Its context keys, bounds and fingerprint are
     taken over.
 
     Args:
@@ -29,8 +31,8 @@ class Aligned(LinearActionMap):
         rotation: R, (k, k), orthogonal: a rotation, a reflection, or flipped signs. Default: the identity.
 
     Raises:
-        TypeError: if `map` is no linear map, or aligned already.
-        ValueError: if `rotation` is not an orthogonal matrix of k rows.
+        TypeError: if ``map`` is no linear map, or aligned already.
+        ValueError: if ``rotation`` is not an orthogonal matrix of k rows.
     """
 
     learns = False
@@ -38,7 +40,7 @@ class Aligned(LinearActionMap):
 
     def __init__(self, map: LinearActionMap, rotation: Tensor | None = None) -> None:
         if isinstance(map, Aligned) or not isinstance(map, LinearActionMap):
-            raise TypeError(f"map must be a linear action map, not yet aligned, got {type(map).__name__}")
+            raise TypeError(f"map must be a linear action map, not yet aligned, got {type(map).__name__}.")
         super().__init__(map.context_dim, map.actuation_dim, map.action_dim)
         rotation = torch.eye(map.action_dim) if rotation is None else rotation.detach().clone()
         _check_orthogonal(rotation, map.action_dim)
@@ -72,7 +74,7 @@ class Aligned(LinearActionMap):
         Raises:
             ValueError: always.
         """
-        raise ValueError(f"an Aligned learns nothing: train its {type(self.map).__name__}, then align that")
+        raise ValueError(f"an Aligned learns nothing: train its {type(self.map).__name__}, then align that.")
 
     def init_args(self) -> dict[str, ActionMap]:
         """The map inside; R is a buffer and comes with the weights."""
@@ -97,7 +99,7 @@ def align(map: ActionMap, directions: Tensor, context: Tensor, *, jacobian: Tens
         jacobian: J, velocity of the tool per actuation, (m, n) or (T, m, n).
 
     Returns:
-        The map inside an `Aligned`.
+        The map inside an ``Aligned``.
 
     Raises:
         TypeError: if the map is not linear in the action.
@@ -106,7 +108,9 @@ def align(map: ActionMap, directions: Tensor, context: Tensor, *, jacobian: Tens
     """
     inner = map.map if isinstance(map, Aligned) else map
     if not isinstance(inner, LinearActionMap):
-        raise TypeError(f"only a map that is linear in the action has axes to turn, got {type(map).__name__}")
+        raise TypeError(
+            f"only a map that is linear in the action has axes to turn, got {type(map).__name__}."
+        )
     _check_shapes(inner, directions, context, jacobian)
     basis = inner.basis(context).double()
     wanted = directions.to(basis)
@@ -119,24 +123,24 @@ def align(map: ActionMap, directions: Tensor, context: Tensor, *, jacobian: Tens
     if rank < inner.action_dim:
         raise ValueError(
             f"the directions determine {rank} of the {inner.action_dim} axes: they must be independent, within what "
-            "the map can do, and not cancel between the contexts"
+            "the map can do, and not cancel between the contexts."
         )
     return Aligned(inner, left @ right)
 
 
 def _check_orthogonal(rotation: Tensor, size: int) -> None:
     if rotation.shape != (size, size):
-        raise ValueError(f"rotation must have shape ({size}, {size}), got {tuple(rotation.shape)}")
+        raise ValueError(f"rotation must have shape ({size}, {size}), got {tuple(rotation.shape)}.")
     gap = (rotation.double().mT @ rotation.double() - torch.eye(size).to(rotation.device)).abs().max()
     if not gap <= ORTHOGONAL:
-        raise ValueError(f"rotation must be orthogonal, but an entry of R^T R - I is {float(gap):.2g}")
+        raise ValueError(f"rotation must be orthogonal, but an entry of R^T R - I is {float(gap):.2g}.")
 
 
 def _check_shapes(map: LinearActionMap, directions: Tensor, context: Tensor, jacobian: Tensor | None) -> None:
     n, k = map.actuation_dim, map.action_dim
     if context.ndim not in (1, 2) or context.shape[-1] != map.context_dim or not context.shape[:-1].numel():
         raise ValueError(
-            f"context must be ({map.context_dim},) or (T, {map.context_dim}), got {tuple(context.shape)}"
+            f"context must be ({map.context_dim},) or (T, {map.context_dim}), got {tuple(context.shape)}."
         )
     rows = n
     leading = [(), context.shape[:-1]]
@@ -144,11 +148,11 @@ def _check_shapes(map: LinearActionMap, directions: Tensor, context: Tensor, jac
         if jacobian.ndim < 2 or jacobian.shape[-1] != n or jacobian.shape[:-2] not in leading:
             raise ValueError(
                 f"jacobian must be (m, {n}), or one such matrix per context, got {tuple(jacobian.shape)} "
-                f"for contexts {tuple(context.shape)}"
+                f"for contexts {tuple(context.shape)}."
             )
         rows = jacobian.shape[-2]
     if directions.shape[-2:] != (rows, k) or directions.shape[:-2] not in leading:
         raise ValueError(
             f"directions must be ({rows}, {k}), or one such matrix per context, got {tuple(directions.shape)} "
-            f"for contexts {tuple(context.shape)}"
+            f"for contexts {tuple(context.shape)}."
         )

@@ -50,11 +50,11 @@ def recorded(map: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> d
 
 
 def named_arguments(map: nn.Module, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments by name that, after those of `positional_arguments`, make a twin of ``map``.
+    """The arguments by name that, after those of ``positional_arguments``, make a twin of ``map``.
 
     Args:
         map: an object that has been constructed; its attributes go before what was given.
-        given: from `recorded`.
+        given: from ``recorded``.
 
     Raises:
         TypeError: if one is neither an attribute that can stand in a file nor was given as such.

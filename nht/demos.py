@@ -1,9 +1,11 @@
 """Demonstrations: whole episodes in a TorchRL replay buffer, beside a manifest.
 
-On disk it is a folder: `manifest.json` says what was recorded, by whom and with which versions, and has a
-fingerprint of the data; `data/` has one raw file per key, mapped into memory when it is read. Nothing is pickled, and
+On disk it is a folder: ``manifest.json`` says what was recorded, by whom and with which versions, and has a
+fingerprint of the data; ``data/`` has one raw file per key, mapped into memory when it is read. Nothing is pickled, and
 a folder is complete or not there at all.
 """
+
+from __future__ import annotations
 
 import hashlib
 import json
@@ -40,14 +42,14 @@ ENTRIES: dict[str, type | tuple[type, ...]] = {
     "versions": dict,
     "fingerprint": str,
 }
-"""Of a manifest; `checksum`, over all of these, is missing in those of earlier versions."""
+"""Of a manifest; ``checksum``, over all of these, is missing in those of earlier versions."""
 
 
 class Demos:
-    """Demonstrations, not to be changed: made by `save_demos`, `load_demos` or one of the methods `from_...`.
+    """Demonstrations, not to be changed: made by ``save_demos``, ``load_demos`` or one of the methods ``from_...``.
 
     Attributes:
-        buffer: replay buffer over all transitions, `buffer.sample(256)`; nothing can be added to it.
+        buffer: replay buffer over all transitions, ``buffer.sample(256)``; nothing can be added to it.
         manifest: env, seed, expert, settings; keys with shapes and types; episodes, transitions; versions;
             fingerprint.
     """
@@ -65,7 +67,7 @@ class Demos:
         context: Tensor | ArrayLike | Mapping[str, Tensor | ArrayLike],
         next_context: Tensor | ArrayLike | Mapping[str, Tensor | ArrayLike] | None = None,
         env: str = "unknown",
-    ) -> "Demos":
+    ) -> Demos:
         """Demonstrations from tensors or NumPy arrays of your own, copied into memory.
 
         Args:
@@ -95,8 +97,8 @@ class Demos:
         episode_key: NestedKey | None = None,
         done_key: NestedKey | None = None,
         env: str = "unknown",
-    ) -> "Demos":
-        """Demonstrations from what TorchRL rolled out, collected or stored: `dataset[:]` of any of its data sets.
+    ) -> Demos:
+        """Demonstrations from what TorchRL rolled out, collected or stored: ``dataset[:]`` of any of its data sets.
 
         Where episodes end is found from ids of trajectories and flags; episodes that do not end are left out, and
         their number is in the manifest under "settings".
@@ -132,8 +134,8 @@ class Demos:
         env: str = "unknown",
         expert: str = "unknown",
         settings: Mapping[str, Any] | None = None,
-    ) -> "Demos":
-        """Demonstrations from a TensorDict as `save_demos` takes it, copied into memory.
+    ) -> Demos:
+        """Demonstrations from a TensorDict as ``save_demos`` takes it, copied into memory.
 
         Raises:
             KeyError: if "actuation" or "episode" is missing.
@@ -174,7 +176,7 @@ class Demos:
         )
 
     def context(self, keys: Sequence[NestedKey]) -> Tensor:
-        """The entries of `keys` side by side, (T, context_dim); no keys give (T, 0).
+        """The entries of ``keys`` side by side, (T, context_dim); no keys give (T, 0).
 
         Raises:
             KeyError: on a key that is not there.
@@ -184,10 +186,12 @@ class Demos:
         for key in keys:
             value = data.get(key, None)
             if not isinstance(value, Tensor):
-                raise KeyError(f"context key {key!r} is not in the demonstrations, which have {listed(data)}")
+                raise KeyError(
+                    f"context key {key!r} is not in the demonstrations, which have {listed(data)}."
+                )
             if value.ndim != 2 or not value.is_floating_point():
                 raise ValueError(
-                    f"context key {key!r} must hold floats (T, width), got {value.dtype} {tuple(value.shape)}"
+                    f"context key {key!r} must hold floats (T, width), got {value.dtype} {tuple(value.shape)}."
                 )
         return torch.cat([self.actuation[:, :0], *(data[key] for key in keys)], dim=-1)
 
@@ -206,7 +210,7 @@ def save_demos(
     Args:
         data: (T,) transitions in order of time: "actuation" (T, n), "episode" (T,) int64, and every raw key
             that may serve as context, (T, width). More keys are welcome: "reward", flags, ("next", key). If
-            there is "done" (T, 1), the last transition of every episode must have it set. Or `Demos`, whose
+            there is "done" (T, 1), the last transition of every episode must have it set. Or ``Demos``, whose
             manifest says what is not given here.
         path: a folder that does not exist yet.
         env: name of the env.
@@ -215,14 +219,16 @@ def save_demos(
         settings: options of env and expert, JSON values.
 
     Raises:
-        FileExistsError: if `path` exists: demonstrations are never overwritten.
+        FileExistsError: if ``path`` exists: demonstrations are never overwritten.
         KeyError: if "actuation" or "episode" is missing.
         OSError: if there is no room.
         ValueError: on data that are no whole, finite demonstrations.
     """
     path = Path(path)
     if path.exists():
-        raise FileExistsError(f"{path} exists, and demonstrations are never overwritten: choose another path")
+        raise FileExistsError(
+            f"{path} exists, and demonstrations are never overwritten: choose another path."
+        )
     about = data.manifest if isinstance(data, Demos) else {}
     data = data.data if isinstance(data, Demos) else data
     manifest = _manifest(
@@ -247,39 +253,39 @@ def save_demos(
 
 
 def load_demos(path: str | Path, *, env: str | None = None) -> Demos:
-    """Opens a folder that `save_demos` wrote; the data stay on disk until read. Nothing is unpickled.
+    """Opens a folder that ``save_demos`` wrote; the data stay on disk until read. Nothing is unpickled.
 
     Args:
         path: the folder.
         env: the env that the demonstrations must be of, if that matters.
 
     Raises:
-        FileNotFoundError: if `path` holds no demonstrations.
+        FileNotFoundError: if ``path`` holds no demonstrations.
         ValueError: on another format version or env, and on data other than the manifest's.
     """
     path = Path(path)
     manifest = _read_manifest(path)
     if env is not None and manifest["env"] != env:
-        raise ValueError(f"{path} holds demonstrations of env {manifest['env']!r}, expected {env!r}")
+        raise ValueError(f"{path} holds demonstrations of env {manifest['env']!r}, expected {env!r}.")
     try:
         data = read_tensordict(path / "data")
     except (OSError, ValueError) as error:
         raise ValueError(f"the data of {path} cannot be read: {error}") from error
     if _described(data) != {name: manifest[name] for name in _described(data)}:
-        raise ValueError(f"the data of {path} are not those of its manifest: they were changed or cut short")
+        raise ValueError(f"the data of {path} are not those of its manifest: they were changed or cut short.")
     return Demos(_buffer(data), manifest)
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     file = path / "manifest.json"
     if not file.is_file():
-        raise FileNotFoundError(f"{path} holds no demonstrations: there is no manifest.json in it")
+        raise FileNotFoundError(f"{path} holds no demonstrations: there is no manifest.json in it.")
     manifest = read_json(file)
     if manifest.get("format") != FORMAT:
-        raise ValueError(f"{path} holds no demonstrations: its manifest.json is not marked {FORMAT!r}")
+        raise ValueError(f"{path} holds no demonstrations: its manifest.json is not marked {FORMAT!r}.")
     found = entry(manifest, "format_version", int, str(file))
     if found != FORMAT_VERSION:
-        raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}")
+        raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}.")
     for name, kind in ENTRIES.items():
         entry(manifest, name, kind, str(file))
     known_entries(manifest, [*ENTRIES, "checksum"], str(file))
@@ -292,7 +298,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _buffer(data: TensorDictBase) -> ReplayBuffer:
-    """A buffer over `data`, not copied, that takes no more."""
+    """A buffer over ``data``, not copied, that takes no more."""
     return ReplayBuffer(storage=TensorStorage(data), writer=ImmutableDatasetWriter())
 
 

@@ -36,7 +36,7 @@ def twin(description: dict[str, Any], allow: Sequence[str] = ()) -> ActionMap:
     """The described map before training, with context keys, fingerprint and saturation of the described one.
 
     Args:
-        description: from `describe`, or from `of_version_1`.
+        description: from ``describe``, or from ``of_version_1``.
         allow: modules that may be imported for its classes.
 
     Raises:
@@ -56,7 +56,7 @@ def twin(description: dict[str, Any], allow: Sequence[str] = ()) -> ActionMap:
         map.context_keys = tuple(_key(key) for key in keys)
     fingerprint = description["data_fingerprint"]
     if not isinstance(fingerprint, str | None):
-        raise TypeError(f"data_fingerprint is {fingerprint!r}")
+        raise TypeError(f"data_fingerprint is {fingerprint!r}.")
     map.data_fingerprint = fingerprint
     map.saturation = description["saturation"]
     return map
@@ -127,7 +127,7 @@ def _decoded(value: Any, allow: Sequence[str]) -> Any:
 def _key(key: Any) -> str | tuple[str, ...]:
     parts = [key] if isinstance(key, str) else key
     if not parts or not all(isinstance(part, str) for part in parts):
-        raise TypeError(f"a context key is {key!r}")
+        raise TypeError(f"a context key is {key!r}.")
     return key if isinstance(key, str) else tuple(parts)
 
 

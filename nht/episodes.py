@@ -1,5 +1,7 @@
 """The layout of demonstrations: whole episodes of finite numbers, checked, or made from data laid out otherwise."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -34,16 +36,16 @@ def whole_episodes(
 
     Returns:
         transitions (T',) with "actuation", "episode" from 0 on, the context, and "reward" and flags (T', 1) where
-        the data have them; and the number of episodes left out. Values are not looked at: see `check`.
+        the data have them; and the number of episodes left out. Values are not looked at: see ``check``.
 
     Raises:
         KeyError: on a key that is not in the data; the message lists those that are.
         ValueError: if nothing says where episodes end, or none does; if the actuation also stands under "next", as
-            what `ActionMapTransform` executed: then it is, at the root, that of the step before.
+            what ``ActionMapTransform`` executed: then it is, at the root, that of the step before.
     """
     _check_not_late(data, actuation_key)
     if data.batch_dims == 0:
-        raise ValueError("transitions need a batch size (T,) or (N, T), got ()")
+        raise ValueError("transitions need a batch size (T,) or (N, T), got ().")
     data = data.cpu()
     first = torch.zeros(data.batch_size, dtype=torch.bool)
     first[..., :1] = True
@@ -56,7 +58,7 @@ def whole_episodes(
     number = _first_of(data, EPISODE_KEYS) if episode_key is None else _entry(data, episode_key)
     if number is None and done is None and int(first.sum()) < 2:
         raise ValueError(
-            f"nothing says where episodes end: name episode_key or done_key; the data have {listed(data)}"
+            f"nothing says where episodes end: name episode_key or done_key; the data have {listed(data)}."
         )
     names = context if isinstance(context, Mapping) else {key: key for key in context}
     laid_out = TensorDict({"actuation": _rows(_entry(data, actuation_key))}, batch_size=len(data))
@@ -99,7 +101,7 @@ def _numbered(data: TensorDict, first: Tensor, number: Tensor | None) -> tuple[T
         if not whole.any():
             raise ValueError(
                 f"none of the {int(first.sum())} episodes ends with done, terminated or truncated: set one of them "
-                "at their last steps, if they are whole, or name another done_key"
+                "at their last steps, if they are whole, or name another done_key."
             )
     left_out = len(torch.unique(episode[~whole]))
     data["episode"] = episode
@@ -130,7 +132,7 @@ def _first_of(data: TensorDictBase, keys: Sequence[NestedKey]) -> Tensor | None:
 def _entry(data: TensorDictBase, key: NestedKey) -> Tensor:
     value = data.get(key, None)
     if not isinstance(value, Tensor):
-        raise KeyError(f"key {key!r} is not in the data, which have {listed(data)}")
+        raise KeyError(f"key {key!r} is not in the data, which have {listed(data)}.")
     return value
 
 
@@ -152,9 +154,9 @@ def check(data: TensorDictBase) -> None:
     """
     for key in ("actuation", "episode"):
         if key not in data:
-            raise KeyError(f"demonstrations need the key {key!r}, these have {listed(data)}")
+            raise KeyError(f"demonstrations need the key {key!r}, these have {listed(data)}.")
     if data.batch_dims != 1 or len(data) == 0:
-        raise ValueError(f"demonstrations need a batch size (T,) with T >= 1, got {tuple(data.batch_size)}")
+        raise ValueError(f"demonstrations need a batch size (T,) with T >= 1, got {tuple(data.batch_size)}.")
     actuation, episode = data["actuation"], data["episode"]
     if (
         actuation.ndim != 2
@@ -164,17 +166,17 @@ def check(data: TensorDictBase) -> None:
     ):
         raise ValueError(
             "actuation must be floats (T, n) and episode integers (T,), got "
-            f"{actuation.dtype} {tuple(actuation.shape)} and {episode.dtype} {tuple(episode.shape)}"
+            f"{actuation.dtype} {tuple(actuation.shape)} and {episode.dtype} {tuple(episode.shape)}."
         )
     for key, value in items(data):
         if not isinstance(value, Tensor):
             raise ValueError(
-                f"demonstrations hold tensors only, but key {key!r} holds a {type(value).__name__}"
+                f"demonstrations hold tensors only, but key {key!r} holds a {type(value).__name__}."
             )
         bad = int((~value.isfinite()).sum())
         if bad:
             raise ValueError(
-                f"demonstrations must be finite, but key {key!r} holds {bad} NaN or infinite values"
+                f"demonstrations must be finite, but key {key!r} holds {bad} NaN or infinite values."
             )
     _check_episodes(data)
 
@@ -186,7 +188,7 @@ def _check_episodes(data: TensorDictBase) -> None:
     if (runs > 1).any():
         raise ValueError(
             f"the rows of an episode must stand together, but those of {int((runs > 1).sum())} do not, "
-            f"the first being episode {int(names[runs > 1][0])}"
+            f"the first being episode {int(names[runs > 1][0])}."
         )
     if "done" not in data:
         return
@@ -194,7 +196,7 @@ def _check_episodes(data: TensorDictBase) -> None:
     if len(unfinished):
         raise ValueError(
             f"demonstrations must be whole episodes, but {len(unfinished)} of {len(names)} end without done, "
-            f"the first being episode {int(unfinished[0])}"
+            f"the first being episode {int(unfinished[0])}."
         )
 
 

@@ -38,10 +38,10 @@ def export_map(
     (batch, n). All are in the map's precision, and for any batch. Without limits, what happens at the robot's is left
     to whoever knows them.
 
-    - `name.onnx`: for ONNX Runtime and other engines.
-    - `name.pt2`: for `torch.export.load`.
-    - `name.pt2`, compiled: machine code for the kind of processor and the PyTorch version that exported it, for
-      `torch::inductor::AOTIModelPackageLoader` in C++ and `torch._inductor.aoti_load_package`. Inputs of a wrong
+    - ``name.onnx``: for ONNX Runtime and other engines.
+    - ``name.pt2``: for ``torch.export.load``.
+    - ``name.pt2``, compiled: machine code for the kind of processor and the PyTorch version that exported it, for
+      ``torch::inductor::AOTIModelPackageLoader`` in C++ and ``torch._inductor.aoti_load_package``. Inputs of a wrong
       width are noticed only if the environment has AOTI_RUNTIME_CHECK_INPUTS=1. Takes a C++ compiler and a minute.
 
     In each, "map" holds the description that a map file has (context keys in order, widths, demonstrated bounds ...)
@@ -49,7 +49,7 @@ def export_map(
     package. "action_scale" in it is the one that is applied here; do not scale again. "low" and "high", where they were
     given, are the limits that the program keeps to, as "saturation" says; null for a motor without one.
 
-    A reader of `path` sees the old file or the whole new one, never a part. The map itself stays as it is.
+    A reader of ``path`` sees the old file or the whole new one, never a part. The map itself stays as it is.
 
     Args:
         map: any action map.
@@ -63,10 +63,10 @@ def export_map(
         The path.
 
     Raises:
-        TypeError: if `map` is no ActionMap.
-        ValueError: on another suffix, on `compiled` for ONNX, on an `action_scale` that is not positive and finite, or
-            on limits that are NaN, of another number than n, or the wrong way round.
-        ImportError: if what the extra `nht[onnx]` installs is missing.
+        TypeError: if ``map`` is no ActionMap.
+        ValueError: on another suffix, on ``compiled`` for ONNX, on an ``action_scale`` that is not positive and finite,
+            or on limits that are NaN, of another number than n, or the wrong way round.
+        ImportError: if what the extra ``nht[onnx]`` installs is missing.
     """
     path = Path(path)
     if not isinstance(map, ActionMap):
@@ -173,7 +173,7 @@ def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> tuple[Tensor,
     """
     if not left or right.ndim != matrix.ndim:
         raise NotImplementedError(
-            "to ONNX, only AX = B with matrices X and B is exported, not XA = B or vectors"
+            "to ONNX, only AX = B with matrices X and B is exported, not XA = B or vectors."
         )
     size = matrix.shape[-1]
     rows = torch.cat([matrix, right], dim=-1)
@@ -187,7 +187,7 @@ def _solve(matrix: Tensor, right: Tensor, *, left: bool = True) -> tuple[Tensor,
         )  # (*batch, size), one of them 1
         row = (pivot.unsqueeze(-1) * rows).sum(-2, keepdim=True)
         row = row / row[..., column : column + 1]
-        rows = rows + (pivot - values).unsqueeze(-1) * row  # the pivot's row becomes `row`, others get a 0
+        rows = rows + (pivot - values).unsqueeze(-1) * row  # the pivot's row becomes ``row``, others get a 0
         unused = unused - pivot
         pivots.append(pivot)
     solution = torch.stack(pivots, dim=-2) @ rows[..., size:]

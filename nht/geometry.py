@@ -8,6 +8,8 @@ With k unit vectors v_1 ... v_k in R^n, Q = H(v_1) ... H(v_k) is an orthogonal n
 one dot product and one addition.
 """
 
+from __future__ import annotations
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -37,7 +39,7 @@ def sphere_exp(tangent: Tensor) -> Tensor:
 
 
 def sphere_log(point: Tensor) -> Tensor:
-    """The tangent that `sphere_exp` turns into a unit vector: (*batch, n) -> (*batch, n - 1); 0 for -e_1, too."""
+    """The tangent that ``sphere_exp`` turns into a unit vector: (*batch, n) -> (*batch, n - 1); 0 for -e_1, too."""
     height, side = point[..., :1], point[..., 1:]
     length = torch.linalg.vector_norm(side, dim=-1, keepdim=True)
     angle = torch.atan2(length, height)
@@ -54,7 +56,7 @@ def reflect(reflectors: Tensor, vector: Tensor) -> Tensor:
         vector: (*batch, n).
 
     Returns:
-        (*batch, n). With `reflectors.flip(-2)` the inverse, for every reflection is its own.
+        (*batch, n). With ``reflectors.flip(-2)`` the inverse, for every reflection is its own.
     """
     if _calls_outweigh_arithmetic(reflectors):
         return _reflect_at_once(reflectors, vector)
@@ -120,7 +122,7 @@ def spanning_reflectors(frame: Tensor) -> Tensor:
         frame: (n, k), orthonormal columns.
 
     Returns:
-        (k, n). Their first entries are not negative: `sphere_exp` reaches them within half a turn.
+        (k, n). Their first entries are not negative: ``sphere_exp`` reaches them within half a turn.
     """
     columns = frame.clone()
     reflectors = []

@@ -1,4 +1,4 @@
-"""Demonstrations from HDF5 files in D4RL's style, with `pip install 'nht[minari]'`."""
+"""Demonstrations from HDF5 files in D4RL's style, with ``pip install 'nht[minari]'``."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def from_hdf5(
     Args:
         path: the file.
         actuation_key: (T, n), what the motors got.
-        context: keys that may serve as context, or such keys by the names they get: `{"joint": "infos/qpos"}`.
+        context: keys that may serve as context, or such keys by the names they get: ``{"joint": "infos/qpos"}``.
         episode_key: (T,) integers that differ between episodes, if the file has them.
         done_key: (T,), true at an episode's last step, where that is neither "terminals" nor "timeouts".
         env: a name for where they come from.
@@ -69,7 +69,7 @@ def hdf5_episodes(
     episode_key: str | None = None,
     done_key: str | None = None,
 ) -> tuple[TensorDict, int]:
-    """What `from_hdf5` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
+    """What ``from_hdf5`` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
     sources = context if isinstance(context, Mapping) else {key: key for key in context}
     needed: dict[tuple[str, ...], str] = {("actuation",): actuation_key}
     needed |= {("context", name): key for name, key in sources.items()}
@@ -91,7 +91,7 @@ def _read(path: Path, needed: dict[tuple[str, ...], str], optional: dict[tuple[s
     """The arrays of the file by our keys."""
     import_h5py()
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
+        raise FileNotFoundError(f"there is no file {path}.")
     wanted = {**needed, **optional}
     with opened(path) as file:
         arrays = {name: read(file, name) for name in sorted(set(wanted.values()))}
@@ -100,7 +100,7 @@ def _read(path: Path, needed: dict[tuple[str, ...], str], optional: dict[tuple[s
     robomimic = any(name.startswith("data/demo_") for name in present)
     if missing:
         hint = f" {ROBOMIMIC}" if robomimic else ""
-        raise KeyError(f"keys {shown(missing)} are not in {path}, which has {shown(present)}.{hint}")
+        raise KeyError(f"keys {shown(missing)} are not in {path}, which has {shown(present)}.{hint}.")
     rows = {
         key: as_tensor(array, f"{path}: {name!r}")
         for key, name in wanted.items()
@@ -108,5 +108,5 @@ def _read(path: Path, needed: dict[tuple[str, ...], str], optional: dict[tuple[s
     }
     lengths = {wanted[key]: len(tensor) if tensor.ndim else 0 for key, tensor in rows.items()}
     if len(set(lengths.values())) > 1:
-        raise ValueError(f"the arrays of {path} must have a row per transition each, got lengths {lengths}")
+        raise ValueError(f"the arrays of {path} must have a row per transition each, got lengths {lengths}.")
     return TensorDict(rows, batch_size=list(lengths.values())[:1])

@@ -58,7 +58,7 @@ def find(file: Any, key: str, hops: int = 0) -> Any:
     """The dataset or group at a key, soft links within the file followed; None if there is none.
 
     Raises:
-        ValueError: through `opened`, if the way leads out of the file or in a circle.
+        ValueError: through ``opened``, if the way leads out of the file or in a circle.
     """
     h5py = import_h5py()
     found, parts = file["/"], [part for part in key.split("/") if part not in ("", ".")]
@@ -72,7 +72,7 @@ def find(file: Any, key: str, hops: int = 0) -> Any:
             name = "/".join(parts[: place + 1])
             raise _RefusedError(
                 f"{file.filename}: {name!r} is a link to {link.path!r} in another file, {link.filename!r}, which is "
-                f"not followed. {TRUST}"
+                f"not followed. {TRUST}."
             )
         if isinstance(link, h5py.SoftLink):
             if hops >= HOPS:
@@ -88,7 +88,7 @@ def read(file: Any, key: str) -> NDArray[Any] | None:
     """The array of the dataset at a key, which is all in this file; None if there is none.
 
     Raises:
-        ValueError: through `opened`, if any of it lies in another file, was never written, or is more than the memory.
+        ValueError: through ``opened``, if any of it lies in another file, was never written, or exceeds the memory.
     """
     dataset = find(file, key)
     if not isinstance(dataset, import_h5py().Dataset):
@@ -111,7 +111,7 @@ def check_dataset(file: Any, dataset: Any, key: str, hops: int = 0) -> int:
         raise _RefusedError(f"{where} holds no values.")
     if external:
         raise _RefusedError(
-            f"{where} keeps its values in another file, {external[0][0]!r}, which is not read. {TRUST}"
+            f"{where} keeps its values in another file, {external[0][0]!r}, which is not read. {TRUST}."
         )
     if virtual:
         _check_virtual(file, dataset, where, hops)
@@ -131,7 +131,7 @@ def _check_virtual(file: Any, dataset: Any, where: str, hops: int) -> None:
     for source in dataset.virtual_sources():
         if source.file_name != ".":
             raise _RefusedError(
-                f"{where} is made of values in another file, {source.file_name!r}, which is not read. {TRUST}"
+                f"{where} is made of values in another file, {source.file_name!r}, which is not read. {TRUST}."
             )
         inner = find(file, source.dset_name)
         if not isinstance(inner, h5py.Dataset) or hops >= HOPS:
@@ -154,7 +154,7 @@ def check_file(file: Any) -> None:
     """Check that nothing in a file leads out of it, whoever reads it afterwards.
 
     Raises:
-        ValueError: through `opened`, with the name of what does.
+        ValueError: through ``opened``, with the name of what does.
     """
     h5py = import_h5py()
     outside: list[str] = []
@@ -212,5 +212,5 @@ def import_h5py() -> ModuleType:
     try:
         import h5py
     except ImportError as error:
-        raise ImportError("HDF5 files need an optional package: pip install 'nht[minari]'") from error
+        raise ImportError("HDF5 files need an optional package: pip install 'nht[minari]'.") from error
     return h5py

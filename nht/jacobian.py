@@ -1,5 +1,7 @@
 """The Jacobian's pseudo-inverse as an action map: the action is the velocity of the tool (A.5)."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 
@@ -21,8 +23,8 @@ class JacobianPinv(LinearActionMap):
     than move its joints without bound. No action of unit length asks for more than 1 / (2 damping) [rad/s].
 
     The arm is given by its Denavit-Hartenberg parameters in the standard (Spong) convention, joint by joint. From one
-    frame to the next: turn about z by the joint angle, shift along z by `offsets`, shift along the new x by `lengths`,
-    turn about it by `twists`. The last frame is the tool.
+    frame to the next: turn about z by the joint angle, shift along z by ``offsets``, shift along the new x by
+    ``lengths``, turn about it by ``twists``. The last frame is the tool.
 
     Args:
         lengths: DH link lengths a [m], n of them, at least 6.
@@ -48,10 +50,10 @@ class JacobianPinv(LinearActionMap):
         if len(set(counts)) > 1 or counts[0] < 6:
             raise ValueError(
                 "lengths, twists and offsets need one number per joint, at least 6 each for a six-dimensional "
-                f"action, got {counts[0]}, {counts[1]} and {counts[2]}"
+                f"action, got {counts[0]}, {counts[1]} and {counts[2]}."
             )
         if not 0 < damping < math.inf:
-            raise ValueError(f"damping must be a positive number, got {damping}")
+            raise ValueError(f"damping must be a positive number, got {damping}.")
         joints = counts[0]
         super().__init__(context_dim=joints, actuation_dim=joints, action_dim=6)
         self.lengths = tuple(float(value) for value in lengths)

@@ -1,5 +1,7 @@
 """Latent action models: conditional autoencoders, plain and as in LASER (Allshire et al., 2021)."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 
@@ -17,7 +19,7 @@ class CAE(ActionMap):
     """Conditional autoencoder: the action is a latent, u = decoder(latent, context).
 
     It is trained on reconstruction alone. Nothing gives the latents a scale or a centre: take the action box from the
-    demonstrations, as ActionMapTransform does by default, where an action of 1 is `action_scale`, the largest
+    demonstrations, as ActionMapTransform does by default, where an action of 1 is ``action_scale``, the largest
     |latent| that they have. No motion, u = 0, need not be the latent 0.
 
     Args:
@@ -92,7 +94,7 @@ class LASER(CAE):
 
     What an action means: with beta_kl > 0 the demonstrations' latents are drawn towards a standard normal
     distribution, so 1 is its standard deviation and a box of +-2 or +-3 holds nearly all latents that the decoder was
-    trained on. ActionMapTransform multiplies by `action_scale`: by default the largest |mean| of the demonstrations.
+    trained on. ActionMapTransform multiplies by ``action_scale``: by default the largest |mean| of the demonstrations.
 
     Args:
         context_dim: width of the context.
@@ -131,7 +133,7 @@ class LASER(CAE):
     ) -> None:
         for name, weight in (("beta_kl", beta_kl), ("beta_dynamics", beta_dynamics)):
             if not 0 <= weight < math.inf:
-                raise ValueError(f"{name} must be a number of 0 or more, got {weight}")
+                raise ValueError(f"{name} must be a number of 0 or more, got {weight}.")
         super().__init__(
             context_dim, actuation_dim, action_dim, hidden, activation, normalise=normalise, seed=seed
         )
@@ -154,7 +156,7 @@ class LASER(CAE):
             ValueError: if beta_dynamics is 0.
         """
         if self.dynamics is None:
-            raise ValueError("this LASER has beta_dynamics=0, and so no latent dynamics")
+            raise ValueError("this LASER has beta_dynamics=0, and so no latent dynamics.")
         return context + self._change_unit() * self.dynamics(context, action)
 
     def loss(self, batch: TensorDictBase) -> Tensor:

@@ -49,7 +49,7 @@ class LinearActionMap(ActionMap):
     ) -> None:
         super().__init__(context_dim, actuation_dim, action_dim)
         if lipschitz is not None and not 0 < lipschitz < torch.inf:
-            raise ValueError(f"lipschitz must be a positive number or None, got {lipschitz}")
+            raise ValueError(f"lipschitz must be a positive number or None, got {lipschitz}.")
         check_choice("lipschitz_norm", lipschitz_norm, get_args(NormKind))
         self.network = None
         self.network_gain = 0.0

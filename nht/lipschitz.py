@@ -2,12 +2,12 @@
 
 A layer s(W x + b) has the constant m |W|, with |W| the spectral norm of its matrix and m the largest slope of
 the activation. The constants of a composition multiply. From the network's output to the basis the map's
-`network_gain` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3), 1 for SCL. The normaliser, which divides
+``network_gain`` comes on top, 2 sqrt(k) for NHT (Theorem 1 of the paper, A.3), 1 for SCL. The normaliser, which divides
 the context by its deviations, is counted with the first layer, so that every statement is about the raw
 context. Heads side by side have the constant of the largest.
 
-What this says of actuations, and of what `decode` makes of them at the motors' limits, is in
-`nht.actuation_lipschitz`.
+What this says of actuations, and of what ``decode`` makes of them at the motors' limits, is in
+``nht.actuation_lipschitz``.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def offset_certificate(map: ActionMap) -> float:
 
 
 class LipschitzProjection:
-    """Keeps a map within its `lipschitz` limit by scaling down its layers (Gouk et al., 2018).
+    """Keeps a map within its ``lipschitz`` limit by scaling down its layers (Gouk et al., 2018).
 
     The limit is that of Q(c), and that of u0(c) where a network gives it: u0 counts like a column more, of an action
     that is always 1. Actuations of actions up to M then have the constant lipschitz (M + 1).
@@ -78,7 +78,7 @@ class LipschitzProjection:
     def __init__(self, map: LinearActionMap) -> None:
         if map.network is None or map.lipschitz is None:
             raise ValueError(
-                f"{type(map).__name__} has no network to limit, or no limit: lipschitz={map.lipschitz}"
+                f"{type(map).__name__} has no network to limit, or no limit: lipschitz={map.lipschitz}."
             )
         frobenius = map.lipschitz_norm == "frobenius"
         self.networks = [
@@ -100,7 +100,7 @@ class LipschitzProjection:
             network.step()
 
     def exact(self) -> None:
-        """Before weights are kept: afterwards `certificate` and `offset_certificate` are at most the limit."""
+        """Before weights are kept: afterwards ``certificate`` and ``offset_certificate`` are at most the limit."""
         for network in self.networks:
             network.exact()
 
@@ -108,8 +108,8 @@ class LipschitzProjection:
 class NetworkProjection:
     """Keeps a network within a Lipschitz constant.
 
-    Each layer may have the constant limit^(1 / layers). The exact spectral norm is too dear for every step: `step`
-    follows it by power iteration, one round a step from where the last one ended, which can be a little low; `exact`
+    Each layer may have the constant limit^(1 / layers). The exact spectral norm is too dear for every step: ``step``
+    follows it by power iteration, one round a step from where the last one ended, which can be a little low; ``exact``
     leaves no doubt. The Frobenius norm, never smaller than the spectral one, is exact in both.
 
     Args:

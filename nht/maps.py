@@ -47,7 +47,7 @@ class NHT(LinearActionMap):
         multi_head: let each reflection have a last hidden layer of its own, of the same width, and its own output
             layer; the layers before are shared. Needs a hidden layer.
         offset: "none" for u0 = 0; "constant", trained from the mean of the demonstrations on; "contextual", from a
-            network of its own, of the same widths, which keeps to `lipschitz` too.
+            network of its own, of the same widths, which keeps to ``lipschitz`` too.
         start: where training starts: "svd", from the plane that SVD finds in the training data, the same for all
             contexts; or "random". With the former a strict limit leaves SVD's plane, not any plane.
         seed: of the initial weights.
@@ -76,7 +76,7 @@ class NHT(LinearActionMap):
     ) -> None:
         super().__init__(context_dim, actuation_dim, action_dim, lipschitz, lipschitz_norm)
         if actuation_dim < 2:
-            raise ValueError(f"NHT needs an actuation_dim of at least 2, got {actuation_dim}")
+            raise ValueError(f"NHT needs an actuation_dim of at least 2, got {actuation_dim}.")
         check_choice("start", start, ("svd", "random"))
         self.hidden = tuple(hidden)
         self.activation = activation
@@ -100,7 +100,7 @@ class NHT(LinearActionMap):
         return sphere_exp(tangents)
 
     def basis(self, context: Tensor) -> Tensor:
-        """Q(c), with orthonormal columns. `forward` and `project` do without it."""
+        """Q(c), with orthonormal columns. ``forward`` and ``project`` do without it."""
         return householder_frame(self.reflectors(context))
 
     def basis_norm(self) -> float:

@@ -1,4 +1,4 @@
-"""TensorDicts in folders of raw files, as `TensorDict.memmap` lays them out: written, and read without trust.
+"""TensorDicts in folders of raw files, as ``TensorDict.memmap`` lays them out: written, and read without trust.
 
 A folder has a ``meta.json``, which says type, shape and batch size, one ``key.memmap`` of raw values for each tensor,
 and one folder for each TensorDict inside. TensorDict's own reader believes the ``meta.json``: it unpickles what is
@@ -102,7 +102,7 @@ def _read(folder: Path) -> Any:
     kind = entry(record, "_type", str, str(file))
     pickled = [name for name in ("other.pickle", "pickle.pkl") if os.path.lexists(folder / name)]
     if pickled or (kind == DATA_STACK and record.get("data") == "pickle.pkl"):
-        raise ValueError(f"{folder} holds pickled data, which could run any code, and is not read. {TRUST}")
+        raise ValueError(f"{folder} holds pickled data, which could run any code, and is not read. {TRUST}.")
     if kind == DATA:
         return _Value(record.get("data"))
     if kind == DATA_STACK and "data" in record:
@@ -111,7 +111,7 @@ def _read(folder: Path) -> Any:
         return _read_stack(folder, record)
     if kind != PLAIN:
         raise ValueError(
-            f"{file} is of {shortened(kind, 80)}, expected a TensorDict or a stack of them. {TRUST}"
+            f"{file} is of {shortened(kind, 80)}, expected a TensorDict or a stack of them. {TRUST}."
         )
     return _read_plain(folder, record)
 
@@ -165,7 +165,7 @@ def _read_stack(folder: Path, record: dict[str, Any]) -> TensorDictBase:
 def _read_tensor(folder: Path, key: str, about: Mapping[str, Any], where: str) -> Tensor:
     """One raw file, mapped so that it cannot be changed."""
     if about.get("is_nested"):
-        raise ValueError(f"{where} is a nested tensor, which is not read. {TRUST}")
+        raise ValueError(f"{where} is a nested tensor, which is not read. {TRUST}.")
     name = entry(about, "dtype", str, where)
     if name not in DTYPES:
         raise ValueError(f"{where} is of type {shortened(name, 80)!r}, expected one of {', '.join(DTYPES)}.")
@@ -224,7 +224,7 @@ def _shape(value: Any, where: object, name: str) -> list[int]:
 
 
 def write_tensordict(data: TensorDictBase, folder: Path) -> None:
-    """Write a TensorDict of tensors into a new folder, as `TensorDict.memmap` lays it out.
+    """Write a TensorDict of tensors into a new folder, as ``TensorDict.memmap`` lays it out.
 
     Written like any file: on a full disk it says so, where writing into mapped memory kills the process.
 

@@ -1,4 +1,4 @@
-"""Demonstrations from Minari datasets and to them, with `pip install 'nht[minari]'`. Nothing is ever downloaded."""
+"""Demonstrations from Minari datasets and to them, with ``pip install 'nht[minari]'``. Nothing is ever downloaded."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def from_minari(
     opened = open_minari(dataset)
     found = opened.env_spec.id if opened.env_spec is not None else "unknown"
     if env is not None and found != env:
-        raise ValueError(f"{opened.id} holds demonstrations of env {found!r}, expected {env!r}")
+        raise ValueError(f"{opened.id} holds demonstrations of env {found!r}, expected {env!r}.")
     data, left_out = minari_episodes(opened, context)
     notes = left_out_observations(opened, context)
     with naming(opened.storage.data_path):
@@ -94,7 +94,7 @@ def left_out_observations(dataset: MinariDataset, context: Any) -> dict[str, lis
 
 
 def open_minari(dataset: MinariDataset | str | Path) -> MinariDataset:
-    """A local dataset from its id, folder or HDF5 file. Raises as `from_minari` does."""
+    """A local dataset from its id, folder or HDF5 file. Raises as ``from_minari`` does."""
     minari = _import_minari()
     if isinstance(dataset, minari.MinariDataset):
         return dataset
@@ -115,14 +115,14 @@ def _data_folder(dataset: str | Path) -> Path:
             return found
     raise FileNotFoundError(
         f"{dataset} is neither the folder of a Minari dataset, with a metadata.json, nor the id of a local one: "
-        f"there are {shown(local_datasets())}"
+        f"there are {shown(local_datasets())}."
     )
 
 
 def minari_episodes(
     dataset: MinariDataset, context: Mapping[str, str] | Sequence[str] | None = None
 ) -> tuple[TensorDict, int]:
-    """What `from_minari` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
+    """What ``from_minari`` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
     targets = context if context is None or isinstance(context, Mapping) else {name: name for name in context}
     with naming(dataset.storage.data_path):
         parts, lengths = [], []
@@ -133,12 +133,12 @@ def minari_episodes(
             if missing := set(targets.values()) - moments.keys():
                 raise KeyError(
                     f"entries {sorted(missing)} are not in episode {episode.id} of {dataset.id}, which has "
-                    f"{shown(moments)}"
+                    f"{shown(moments)}."
                 )
             parts.append(_transitions(episode, moments, set(targets.values())))
             lengths.append(len(episode))
         if targets is None or not sum(lengths):
-            raise ValueError(f"the Minari dataset {dataset.id} has no transitions")
+            raise ValueError(f"the Minari dataset {dataset.id} has no transitions.")
         return whole_episodes(
             _joined(dataset.id, parts, lengths),
             context={tuple(name.split("/")): ("context", key) for name, key in targets.items()},
@@ -149,7 +149,7 @@ def _joined(name: str, parts: list[dict[tuple[str, ...], Array]], lengths: list[
     """The rows of all episodes one after another, with the number of each one's episode."""
     if differing := {key for part in parts for key in part.keys() ^ parts[0].keys()}:
         entries = sorted("/".join(key) for key in differing)
-        raise ValueError(f"some episodes of {name} have the entries {shown(entries)}, others lack them")
+        raise ValueError(f"some episodes of {name} have the entries {shown(entries)}, others lack them.")
     columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     rows = {key: as_tensor(column, f"{name}, {'/'.join(key)}") for key, column in columns.items()}
     rows["episode",] = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
@@ -178,7 +178,7 @@ def _moments(dataset: MinariDataset, episode: EpisodeData) -> dict[str, Array]:
     actions = episode.actions
     if not isinstance(actions, np.ndarray):
         raise ValueError(
-            f"the actions of {dataset.id} must be arrays, its action space is {dataset.action_space}"
+            f"the actions of {dataset.id} must be arrays, its action space is {dataset.action_space}."
         )
     _check_shape(dataset, episode, "actions", actions, (steps, *dataset.action_space.shape))
     for name in ("terminations", "truncations"):
@@ -231,7 +231,7 @@ def _check_shape(
 ) -> None:
     if values.shape != expected:
         raise ValueError(
-            f"{name} in episode {episode.id} of {dataset.id} must have shape {expected}, got {values.shape}"
+            f"{name} in episode {episode.id} of {dataset.id} must have shape {expected}, got {values.shape}."
         )
 
 
@@ -245,7 +245,7 @@ def to_minari(
     """Writes demonstrations as a new local Minari dataset, all or nothing.
 
     Minari decides where: in the folder that the environment variable MINARI_DATASETS_PATH names, else in the
-    user's home. Author, licence and the like can be added by `dataset.storage.update_metadata`.
+    user's home. Author, licence and the like can be added by ``dataset.storage.update_metadata``.
 
     Args:
         demos: with reward, terminated, truncated, and the observations under "next" too.
@@ -253,7 +253,7 @@ def to_minari(
         env: id of the Gymnasium env that they are of: the dataset then has its spec and its spaces. Otherwise the
             spaces are unbounded boxes.
         observation_keys: what makes up the observation: "observation" alone is a Box, all else a Dict. By
-            default "observation" where `env` is given, otherwise all. Other keys go into the infos.
+            default "observation" where ``env`` is given, otherwise all. Other keys go into the infos.
 
     Raises:
         ImportError: without the extra.
@@ -266,7 +266,7 @@ def to_minari(
     parse_dataset_id(dataset_id)
     folder = datasets_root() / dataset_id
     if folder.exists():
-        raise FileExistsError(f"the Minari dataset {dataset_id} exists: choose another name or version")
+        raise FileExistsError(f"the Minari dataset {dataset_id} exists: choose another name or version.")
     if observation_keys is None and env is not None:
         observation_keys = ["observation"]
     buffers = _buffers(demos, observation_keys)
@@ -318,7 +318,7 @@ def _buffers(demos: Demos, observation_keys: Sequence[str] | None) -> list[Episo
     names = [key_name(key) for key, value in items(now) if value.is_floating_point()]
     observed = names if observation_keys is None else list(observation_keys)
     if missing := set(observed) - set(names):
-        raise ValueError(f"observation_keys {sorted(missing)} are not among the demonstrations' {names}")
+        raise ValueError(f"observation_keys {sorted(missing)} are not among the demonstrations' {names}.")
     lengths = demos.episode.unique_consecutive(return_counts=True)[1].tolist()
     return [
         _buffer(data[rows], torch.cat([now[rows], following[rows[-1:]]]), observed)
@@ -351,13 +351,13 @@ def _now_and_next(data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]
     missing = [name for name in ("reward", "terminated", "truncated") if name not in data]
     if missing or following.is_empty():
         lacking = [*missing, *(["observations under 'next'"] if following.is_empty() else [])]
-        raise ValueError(f"a Minari dataset needs {', '.join(lacking)}, which the demonstrations lack")
+        raise ValueError(f"a Minari dataset needs {', '.join(lacking)}, which the demonstrations lack.")
     now = data.select(*following.keys(include_nested=True, leaves_only=True))
     within = data["episode"][1:] == data["episode"][:-1]
     if not (now[1:][within] == following[:-1][within]).all():
         raise ValueError(
             "a Minari dataset has one observation per moment, but these demonstrations hold under 'next' another one "
-            "than their next row"
+            "than their next row."
         )
     return now, following
 
@@ -381,5 +381,5 @@ def _import_minari() -> ModuleType:
     try:
         import minari
     except ImportError as error:
-        raise ImportError("Minari datasets need an optional package: pip install 'nht[minari]'") from error
+        raise ImportError("Minari datasets need an optional package: pip install 'nht[minari]'.") from error
     return minari

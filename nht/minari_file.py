@@ -54,7 +54,7 @@ def check_dataset(folder: Path) -> None:
     kind = entry(about, "data_format", str, str(file))
     if kind != "hdf5":
         raise ValueError(
-            f"{file}: 'data_format' is {shortened(kind, 40)!r}, expected 'hdf5', the one that is read. {TRUST}"
+            f"{file}: 'data_format' is {shortened(kind, 40)!r}, expected 'hdf5', the one that is read. {TRUST}."
         )
     for name in ("total_episodes", "total_steps"):
         if not 0 <= entry(about, name, int, str(file)) < 2**48:
@@ -83,7 +83,7 @@ def _space(about: dict[str, Any], name: str, file: Path) -> dict[str, Any]:
     if name not in about:
         raise ValueError(
             f"{file} has no {name!r}: to find it, Minari would make the environment that 'env_spec' names, which can "
-            f"run any code. {TRUST}"
+            f"run any code. {TRUST}."
         )
     where = f"{file}: {name!r}"
     space = parse_json(entry(about, name, str, str(file)), where)

@@ -1,5 +1,7 @@
 """What turns a context into the description of an action map: a multilayer perceptron, with one head or several."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Literal, get_args
@@ -66,10 +68,10 @@ class ContextNetwork(nn.Module):
         super().__init__()
         check_choice("activation", activation, get_args(Activation))
         if context_dim < 1 or any(width < 1 for width in hidden):
-            raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}")
+            raise ValueError(f"widths must be at least 1, got {context_dim=} and hidden={list(hidden)}.")
         if heads > 1 and not len(hidden):
             raise ValueError(
-                "several heads need a hidden layer that they can have of their own, got hidden=[]"
+                "several heads need a hidden layer that they can have of their own, got hidden=[]."
             )
         self.activation = activation
         with torch.random.fork_rng(devices=()):
@@ -113,7 +115,7 @@ class ContextNetwork(nn.Module):
 
     @torch.no_grad()
     def start_from_one_output(self, size: float, seed: int) -> None:
-        """Lets all contexts start from nearly the same output, normally distributed with deviation `size`."""
+        """Lets all contexts start from nearly the same output, normally distributed with deviation ``size``."""
         head = self.linear(-1)
         head.weight.mul_(0.1)
         head.bias.normal_(std=size, generator=torch.Generator().manual_seed(int(seed)))
@@ -127,6 +129,6 @@ class ContextNetwork(nn.Module):
 
 
 def check_choice(name: str, given: str, allowed: Sequence[str]) -> None:
-    """Raises ValueError unless what was given for the argument `name` is allowed."""
+    """Raises ValueError unless what was given for the argument ``name`` is allowed."""
     if given not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {given!r}")
+        raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {given!r}.")

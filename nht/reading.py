@@ -60,7 +60,7 @@ def read_text(file: Path) -> str:
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """The JSON object in a plain file. Raises as `read_text` does, and ValueError on anything but an object."""
+    """The JSON object in a plain file. Raises as ``read_text`` does, and ValueError on anything but an object."""
     return parse_json(read_text(file), str(file))
 
 
@@ -84,7 +84,7 @@ def parse_json(text: str | bytes, name: str) -> dict[str, Any]:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError("an object has the same name twice")
+        raise ValueError("an object has the same name twice.")
     return found
 
 

@@ -1,5 +1,7 @@
 """Small corrections in all n dimensions, on top of any action map."""
 
+from __future__ import annotations
+
 import math
 
 import torch
@@ -13,7 +15,7 @@ class Residual(ActionMap):
     """Another map's action plus n corrections: u = map(a) + scale r, for an action (a, r) of k + n entries.
 
     So no actuation is out of reach, yet those that the map gives are the easiest to find. A correction of 1 adds
-    `scale` to its motor, in units of actuation; ActionMapTransform multiplies it by `action_scale`, as all of the
+    ``scale`` to its motor, in units of actuation; ActionMapTransform multiplies it by ``action_scale``, as all of the
     action.
 
     There is nothing to learn: wrap a trained map. Its context keys, scale, bounds and fingerprint are taken over.
@@ -23,18 +25,18 @@ class Residual(ActionMap):
         scale: weight of the corrections. For no corrections, use the map itself.
 
     Raises:
-        TypeError: if `map` is no action map, or one with corrections already.
-        ValueError: if `scale` is not a positive number.
+        TypeError: if ``map`` is no action map, or one with corrections already.
+        ValueError: if ``scale`` is not a positive number.
     """
 
     learns = False
 
     def __init__(self, map: ActionMap, scale: float) -> None:
         if isinstance(map, Residual) or not isinstance(map, ActionMap):
-            raise TypeError(f"map must be an action map without corrections, got {type(map).__name__}")
+            raise TypeError(f"map must be an action map without corrections, got {type(map).__name__}.")
         if not 0 < scale < math.inf:
             raise ValueError(
-                f"scale must be a positive number, got {scale}; for no corrections, use the map itself"
+                f"scale must be a positive number, got {scale}; for no corrections, use the map itself."
             )
         super().__init__(map.context_dim, map.actuation_dim, map.action_dim)
         self.action_dim = map.action_dim + map.actuation_dim  # k + n: corrections make it more than n
@@ -67,5 +69,5 @@ class Residual(ActionMap):
             ValueError: always.
         """
         raise ValueError(
-            f"a Residual learns nothing: train its {type(self.map).__name__}, then wrap that in a Residual"
+            f"a Residual learns nothing: train its {type(self.map).__name__}, then wrap that in a Residual."
         )

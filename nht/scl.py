@@ -1,5 +1,7 @@
 """SCL, the state-conditioned linear map: a basis without structure, to compare with orthonormal ones (A.4)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from tensordict import TensorDictBase
@@ -16,7 +18,7 @@ class SCL(LinearActionMap):
 
     An action is projected by the pseudo-inverse, damped at the level of rounding. Nothing limits the norm of the
     basis, and the loss (Eq. 6) does not depend on it: it may grow in training, and with it the actuation that an
-    action of 1 stands for. `lipschitz` limits how fast the basis changes, not how long its columns are.
+    action of 1 stands for. ``lipschitz`` limits how fast the basis changes, not how long its columns are.
 
     The network's output is the basis, entry by entry. Its Euclidean norm is the Frobenius norm of the basis, which is
     no smaller than the spectral one: from output to basis the Lipschitz constant is 1.
@@ -32,7 +34,7 @@ class SCL(LinearActionMap):
             context.
         lipschitz_norm: the norm of the layers' matrices that is limited to this end, "spectral" or "frobenius".
         offset: "none" for u0 = 0; "constant", trained from the mean of the demonstrations on; "contextual", from a
-            network of its own, of the same widths, which keeps to `lipschitz` too. Then u = u0(c) + Q(c) a.
+            network of its own, of the same widths, which keeps to ``lipschitz`` too. Then u = u0(c) + Q(c) a.
         seed: of the initial weights.
 
     Raises:

@@ -44,7 +44,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
         The path.
 
     Raises:
-        TypeError: if an argument of the constructor cannot stand in a file; `train_map` says so before it trains.
+        TypeError: if an argument of the constructor cannot stand in a file; ``train_map`` says so before it trains.
         ValueError: if a weight is not finite, or a map loaded from the file would be another one.
     """
     path = Path(path)
@@ -66,7 +66,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
     imported. Files of format version 1 load as they did; they clip actuations.
 
     Args:
-        path: of a file that `save_map` wrote.
+        path: of a file that ``save_map`` wrote.
         device: where the map shall be.
         allow: modules and packages that may be imported, and so run, for the map's class.
 
@@ -83,7 +83,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
     except Exception as error:  # whatever stands in a file, the answer names the file
         known = isinstance(error, ValueError) and not isinstance(error, UnicodeError | json.JSONDecodeError)
         reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
-        raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}") from error
+        raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}.") from error
     return map.to(device).eval().requires_grad_(False)
 
 

@@ -1,5 +1,7 @@
 """Offline training of an action map from demonstrations."""
 
+from __future__ import annotations
+
 import copy
 import math
 import time
@@ -51,7 +53,7 @@ def train_map(
 ) -> MapTraining:
     """Trains a map in place, on its own device, and keeps the weights that were best on held-out episodes.
 
-    If `map.fit` is no closed form, Adam follows `map.loss`, with a learning rate that falls to 0 along a
+    If ``map.fit`` is no closed form, Adam follows ``map.loss``, with a learning rate that falls to 0 along a
     cosine. The map also learns its context keys, action scale, bounds and the fingerprint of the data.
 
     Args:
@@ -110,7 +112,7 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
 
     Args:
         map: any action map.
-        context: (T, context_dim); of demonstrations `demos.context(map.context_keys)`.
+        context: (T, context_dim); of demonstrations ``demos.context(map.context_keys)``.
         actuation: (T, n).
     """
     missed = total = 0.0
@@ -118,7 +120,7 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
         missed += float((u - map(map.project(u, c), c)).double().square().sum())
         total += float(u.double().square().sum())
     if total == 0:
-        raise ValueError("the projection error is relative to the actuations, and these are all zero")
+        raise ValueError("the projection error is relative to the actuations, and these are all zero.")
     return missed / total
 
 
@@ -131,7 +133,7 @@ def split_episodes(episode: Tensor, share: float, seed: int) -> Tensor:
     if len(names) == 1 and len(episode) > 1:
         return torch.arange(len(episode)) >= len(episode) - max(1, round(share * len(episode)))
     if len(names) < 2:
-        raise ValueError(f"at least 2 transitions are needed, to hold one out, but there is {len(episode)}")
+        raise ValueError(f"at least 2 transitions are needed, to hold one out, but there is {len(episode)}.")
     count = min(max(1, round(share * len(names))), len(names) - 1)
     order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))
     return torch.isin(episode, names[order[:count]])
@@ -196,7 +198,7 @@ def _keep_best(
         if step - best_step >= patience:
             break
     if diverged:
-        raise FloatingPointError(f"training diverged in the first {step} steps; lower learning_rate")
+        raise FloatingPointError(f"training diverged in the first {step} steps; lower learning_rate.")
     map.load_state_dict(best_weights)
     return step, best_step
 
@@ -213,7 +215,7 @@ def _context_keys(
     if "context" in demos.data:
         return ("context",)
     raise ValueError(
-        f"context_keys must name some of the demonstrations' keys: {', '.join(demos.manifest['keys'])}"
+        f"context_keys must name some of the demonstrations' keys: {', '.join(demos.manifest['keys'])}."
     )
 
 
@@ -222,12 +224,12 @@ def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> T
     context, actuation = demos.context(keys), demos.actuation
     if actuation.shape[-1] != map.actuation_dim:
         raise ValueError(
-            f"demonstrated actuations have {actuation.shape[-1]} dimensions, the map's {map.actuation_dim}"
+            f"demonstrated actuations have {actuation.shape[-1]} dimensions, the map's {map.actuation_dim}."
         )
     if context.shape[-1] != map.context_dim:
         widths = ", ".join(f"{key!r}: {demos.data[key].shape[-1]}" for key in keys)
         raise ValueError(
-            f"the map's context has width {map.context_dim}, the keys give {context.shape[-1]}: {widths}"
+            f"the map's context has width {map.context_dim}, the keys give {context.shape[-1]}: {widths}."
         )
     affine = isinstance(map, LinearActionMap) and map.offset_model is not None
     spread = actuation.double() - actuation.double().mean(0) if affine else actuation.double()
@@ -236,7 +238,7 @@ def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> T
     if map.learns and rank < map.action_dim < map.actuation_dim:
         raise ValueError(
             f"the demonstrations have {rank} independent actuations"
-            f"{', measured from their mean' if affine else ''}, too few for k = {map.action_dim}"
+            f"{', measured from their mean' if affine else ''}, too few for k = {map.action_dim}."
         )
     data = TensorDict({"context": context, "actuation": actuation}, batch_size=len(actuation))
     if map.needs_next_context:
@@ -250,7 +252,7 @@ def _next_context(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> Te
     if missing:
         raise KeyError(
             f"{type(map).__name__} learns from the next context too, but the demonstrations lack "
-            f"{', '.join(repr(key) for key in missing)}; a LASER with beta_dynamics=0 does without"
+            f"{', '.join(repr(key) for key in missing)}; a LASER with beta_dynamics=0 does without."
         )
     return demos.context(following)
 
@@ -268,8 +270,8 @@ def _check_numbers(
 ) -> None:
     for name, value in (("batch_size", batch_size), ("max_steps", max_steps), ("patience", patience)):
         if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+            raise ValueError(f"{name} must be at least 1, got {value}.")
     if not learning_rate > 0:
-        raise ValueError(f"learning_rate must be positive, got {learning_rate}")
+        raise ValueError(f"learning_rate must be positive, got {learning_rate}.")
     if not 0 < validation_share < 1:
-        raise ValueError(f"validation_share must be between 0 and 1, got {validation_share}")
+        raise ValueError(f"validation_share must be between 0 and 1, got {validation_share}.")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def checked_forward(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A map's `forward` that looks at the last dimensions of action and context before."""
+    """A map's ``forward`` that looks at the last dimensions of action and context before."""
 
     @functools.wraps(method)
     def forward(self: Any, action: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:
@@ -25,7 +25,7 @@ def checked_forward(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def checked_project(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A map's `project` that looks at the last dimensions of actuation and context before."""
+    """A map's ``project`` that looks at the last dimensions of actuation and context before."""
 
     @functools.wraps(method)
     def project(self: Any, actuation: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:

@@ -1,4 +1,4 @@
-"""Entry points: demonstrations, maps, reinforcement learning, evaluation. Where `nht` and `nht.envs` meet."""
+"""Entry points: demonstrations, maps, reinforcement learning, evaluation. Where ``nht`` and ``nht.envs`` meet."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ def _is_installed(module: str) -> bool:
 # Told here, by that name, it is one line also where Python runs a recipe with -m, and no traceback.
 if _missing := [module for module in _NEEDED if not _is_installed(module)]:
     raise ModuleNotFoundError(
-        f"the recipes need {', '.join(_missing)}: pip install 'nht[recipes]'", name=__name__
+        f"the recipes need {', '.join(_missing)}: pip install 'nht[recipes]'.", name=__name__
     )

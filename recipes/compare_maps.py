@@ -96,7 +96,7 @@ def largest_ratio(map: nht.ActionMap, context: torch.Tensor) -> float:
     """How fast the interface changes with the context, at most, between neighbours in time.
 
     Of a linear map the largest |Q(c) - Q(c')| / |c - c'|, in the spectral norm. Of any other, which has no basis, the
-    largest |u(a, c) - u(a, c')| / (|a| |c - c'|) for the fixed actions a of plus and minus `action_scale` on an axis.
+    largest |u(a, c) - u(a, c')| / (|a| |c - c'|) for the fixed actions a of plus and minus ``action_scale`` on an axis.
 
     Args:
         map: any map.

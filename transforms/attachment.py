@@ -154,7 +154,7 @@ class Attachment(EarlyReader):
     def _attach_context(
         self, base: EnvBase, chain: Compose | None, ahead: list[Transform], made: set[NestedKey]
     ) -> None:
-        """Finds out who has to read the context, and when; `made` are the keys that other transforms make."""
+        """Finds out who has to read the context, and when; ``made`` are the keys that other transforms make."""
         observation_spec = base.full_observation_spec
         if made and ahead:
             check_writers(ahead, self.context_keys, made)

@@ -16,7 +16,7 @@ class EarlyReader(Transform):
     """A transform that may have to read observations before transforms that run ahead of it rewrite them.
 
     Attributes:
-        reads_early: whether `read_raw` is called, by the chain around it, before the first rewriter runs.
+        reads_early: whether ``read_raw`` is called, by the chain around it, before the first rewriter runs.
     """
 
     reads_early = False

@@ -33,7 +33,7 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
     """The bases of maps along a demonstration: beside each other the maps, below each other their columns.
 
     A panel has a line for each motor; of a long demonstration it shows the first steps. What stands for the basis of
-    a map that is not linear is said at `local_basis`.
+    a map that is not linear is said at ``local_basis``.
 
     Args:
         maps: trained maps, by the name to show.
@@ -46,7 +46,7 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
     """
     rows = (demos.episode == episode).nonzero().flatten()[:LONGEST]
     if not len(rows):
-        raise ValueError(f"there is no episode {episode}: the last is {int(demos.episode.max())}")
+        raise ValueError(f"there is no episode {episode}: the last is {int(demos.episode.max())}.")
     actuation = demos.actuation[rows]
     axes = max(map.action_dim for map in maps.values())
     figure, panels = _panels(axes, len(maps), width=2.6, height=2.1, sharex=True)
@@ -130,7 +130,7 @@ def local_basis(map: nht.ActionMap, context: Tensor, actuation: Tensor) -> Tenso
 
 @torch.no_grad()
 def axis_motion(map: nht.ActionMap, context: Tensor) -> Tensor:
-    """The actuation that an action of `action_scale` on each axis adds to that of no action.
+    """The actuation that an action of ``action_scale`` on each axis adds to that of no action.
 
     Args:
         map: any map.
@@ -197,5 +197,5 @@ def _save(figure: Figure, path: str | Path) -> None:
 
 def _keys(map: nht.ActionMap) -> list[str]:
     if map.context_keys is None:
-        raise ValueError(f"this {type(map).__name__} is not trained: it has no context keys")
+        raise ValueError(f"this {type(map).__name__} is not trained: it has no context keys.")
     return list(map.context_keys)

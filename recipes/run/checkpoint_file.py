@@ -147,14 +147,14 @@ class CheckpointFile:
         """By name; each once, stored as it is, and all together no larger than the file."""
         members = {info.filename: info for info in self._archive.infolist()}
         if len(members) < len(self._archive.infolist()):
-            raise ValueError("two members have the same name")
+            raise ValueError("two members have the same name.")
         for name, info in members.items():
             if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
-                raise ValueError(f"{shortened(name, 80)!r} is compressed or encrypted, expected it as it is")
+                raise ValueError(f"{shortened(name, 80)!r} is compressed or encrypted, expected it as it is.")
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or "\\" in name:
-                raise ValueError(f"{shortened(name, 80)!r} would lie outside")
+                raise ValueError(f"{shortened(name, 80)!r} would lie outside.")
         if sum(info.file_size for info in members.values()) > self.file.stat().st_size:
-            raise ValueError("its members are said to be larger than the file")
+            raise ValueError("its members are said to be larger than the file.")
         return members
 
     def _read_manifest(self) -> dict[str, Any]:
