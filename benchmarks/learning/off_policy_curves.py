@@ -18,7 +18,7 @@ from nht.recipes.study.curves import plot, read_runs, summarise
 from nht.recipes.study.report import to_markdown
 
 RESULTS = Path(__file__).parents[1] / "results"
-COLUMNS = ["interface", "seed", "frames", "eval_return", "updates", "seconds"]
+COLUMNS = ["task", "algorithm", "interface", "seed", "frames", "eval_return", "updates", "seconds"]
 EVERY, STEPS = 20_000, 300_000
 
 
@@ -27,23 +27,23 @@ def recorded_ddpg() -> pandas.DataFrame:
     rows = pandas.read_csv(RESULTS / "half_cheetah" / "ddpg.csv")
     chosen = (rows["learning_rate"] == 3e-4) & ~rows["bfloat16"] & (rows["frames"] % EVERY == 0)
     rows = rows[chosen].groupby("seed").filter(lambda run: run["frames"].max() >= STEPS)
-    return rows.assign(interface="DDPG, raw")
+    return rows.assign(task="half_cheetah", algorithm="ddpg", interface="raw")
 
 
 def main(folders: list[Path]) -> None:
     """Write rows, table and figure; print the table."""
     curves = read_runs(folders)
     earlier = recorded_ddpg()
-    found = set(zip(curves["interface"], curves["seed"], strict=True))
-    fresh = [pair not in found for pair in zip(earlier["interface"], earlier["seed"], strict=True)]
+    found = set(zip(curves["algorithm"], curves["seed"], strict=True))
+    fresh = [pair not in found for pair in zip(earlier["algorithm"], earlier["seed"], strict=True)]
     curves = pandas.concat([curves, earlier[fresh]], ignore_index=True)
-    curves = curves.sort_values(["interface", "seed", "frames"])
+    curves = curves.sort_values(["algorithm", "seed", "frames"])
     out = RESULTS / "half_cheetah_off_policy"
     out.mkdir(exist_ok=True)
     curves[COLUMNS].round(1).to_csv(out / "curves.csv", index=False)
-    table = summarise(curves, "return")
+    table = summarise(curves, "return", "algorithm")
     (out / "table.md").write_text(to_markdown(table))
-    plot(curves, "return", "HalfCheetah, raw torques", out / "return.png")
+    plot(curves, "return", "HalfCheetah, raw torques", out / "return.png", "algorithm")
     print(table.to_string(index=False))
 
 
