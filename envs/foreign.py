@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,11 +30,8 @@ from torchrl.envs.transforms import (
 
 from nht.envs.foreign_specs import check_specs
 from nht.envs.pictures import Pictures, check_mode
-from nht.envs.simulation import DEFAULT_SIZE
+from nht.envs.simulation import DEFAULT_SIZE, CopyRenderer
 from nht.envs.torchrl_internals import members
-
-if TYPE_CHECKING:
-    from nht.envs.rendering import CopyRenderer, ForeignRenderer
 
 LONGEST_EPISODE = 1_000
 """Environment steps after which an episode is truncated where the environment itself knows no limit."""
@@ -115,9 +112,34 @@ class ForeignTask:
         Raises:
             RuntimeError: if the environment, or this machine, cannot draw; the message says what is missing.
         """
-        from nht.envs.rendering import ForeignRenderer
-
         return ForeignRenderer(self, width, height, camera)
+
+
+class ForeignRenderer:
+    """Renders copies of an environment of another library, each on its own: their models may differ.
+
+    Args:
+        task: the simulators to look at.
+        width: picture width [pixel].
+        height: picture height [pixel].
+        camera: name or number of a camera, where there is a choice; None is the first one.
+
+    Raises:
+        RuntimeError: if the environment, or this machine, cannot draw; the message says what is missing.
+        ValueError: if there is no such camera.
+    """
+
+    def __init__(self, task: ForeignTask, width: int, height: int, camera: str | int | None) -> None:
+        self._renderers = [copy.renderer(width, height, camera) for copy in task.copies]
+
+    def frame(self, row: int = 0, trail: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+        """The copy ``row`` as it stands now; as of ``Renderer``."""
+        return self._renderers[row].frame(trail)
+
+    def close(self) -> None:
+        """Release the renderers of all copies."""
+        for renderer in self._renderers:
+            renderer.close()
 
 
 class ForeignEnv(SerialEnv):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -19,11 +19,9 @@ from nht.envs.foreign import ForeignCopy
 from nht.envs.gymnasium_internals import EpisodeClock
 from nht.envs.mujoco_copy import Simulator
 from nht.envs.python_state import PythonState
+from nht.envs.simulation import CopyRenderer
 from nht.envs.task import BatchedTask
 from nht.envs.torchrl_internals import wrapped
-
-if TYPE_CHECKING:
-    from nht.envs.rendering import CopyRenderer
 
 FRAME_RATE = 30.0
 """Steps per second of simulated time, where an environment does not say."""

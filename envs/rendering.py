@@ -10,7 +10,7 @@ import sys
 import weakref
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import gymnasium
 import mujoco
@@ -20,11 +20,19 @@ from numpy.typing import NDArray
 
 from nht.envs.simulation import DEFAULT_SIZE
 
-if TYPE_CHECKING:
-    from nht.envs.foreign import ForeignTask
-    from nht.envs.task import Array, BatchedTask
+Array = NDArray[np.float64]
 
 LINE = np.array([0.15, 0.35, 0.85, 0.9], dtype=np.float32)  # red, green, blue, opacity
+
+
+class Scene(Protocol):
+    """What is drawn: copies that share a model, each a row of one state array. ``BatchedTask`` is one."""
+
+    model: mujoco.MjModel
+    state: Array
+
+    def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
+        """Add what the model does not hold (goals, marks) of copy ``row``."""
 
 
 class SceneRenderer:
@@ -43,7 +51,7 @@ class SceneRenderer:
 
     def __init__(
         self,
-        task: BatchedTask,
+        task: Scene,
         width: int = DEFAULT_SIZE[0],
         height: int = DEFAULT_SIZE[1],
         camera: str | int = 0,
@@ -72,49 +80,6 @@ class SceneRenderer:
     def close(self) -> None:
         """Release the OpenGL context."""
         self._renderer.close()
-
-
-class CopyRenderer(Protocol):
-    """Takes pictures of one copy of an environment of another library."""
-
-    def frame(self, trail: Array | None = None) -> NDArray[np.uint8]:
-        """The copy as it stands now, ``(height, width, 3)``; ``trail`` as of ``Renderer``."""
-
-    def close(self) -> None:
-        """Release what drawing needs."""
-
-
-class ForeignRenderer:
-    """Renders copies of an environment of another library, each on its own: their models may differ.
-
-    Args:
-        task: the simulators to look at.
-        width: picture width [pixel].
-        height: picture height [pixel].
-        camera: name or number of a camera, where there is a choice; None is the first one.
-
-    Raises:
-        RuntimeError: if the environment, or this machine, cannot draw; the message says what is missing.
-        ValueError: if there is no such camera.
-    """
-
-    def __init__(
-        self,
-        task: ForeignTask,
-        width: int = DEFAULT_SIZE[0],
-        height: int = DEFAULT_SIZE[1],
-        camera: str | int | None = None,
-    ) -> None:
-        self._renderers = [copy.renderer(width, height, camera) for copy in task.copies]
-
-    def frame(self, row: int = 0, trail: Array | None = None) -> NDArray[np.uint8]:
-        """The copy ``row`` as it stands now; as of ``SceneRenderer``."""
-        return self._renderers[row].frame(trail)
-
-    def close(self) -> None:
-        """Release the renderers of all copies."""
-        for renderer in self._renderers:
-            renderer.close()
 
 
 class MujocoRenderer:

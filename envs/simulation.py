@@ -82,3 +82,13 @@ class Renderer(Protocol):
 
     def close(self) -> None:
         """Release what drawing needs."""
+
+
+class CopyRenderer(Protocol):
+    """Takes pictures of one copy of an environment of another library."""
+
+    def frame(self, trail: NDArray[np.float64] | None = None) -> NDArray[np.uint8]:
+        """The copy as it stands now, ``(height, width, 3)``; ``trail`` as of ``Renderer``."""
+
+    def close(self) -> None:
+        """Release what drawing needs."""

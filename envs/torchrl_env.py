@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torchrl.envs import DMControlWrapper, EnvBase, GymWrapper
 
 from nht.envs.foreign import LONGEST_EPISODE, ForeignCopy, ForeignEnv
 from nht.envs.gymnasium_copies import FRAME_RATE, gymnasium_copy
+from nht.envs.simulation import CopyRenderer
 from nht.envs.suite_copy import SuiteCopy
 from nht.envs.table import imported
-
-if TYPE_CHECKING:
-    from nht.envs.rendering import CopyRenderer
 
 
 def make_torchrl(
