@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from nht.recipes.config import DDPG
 from nht.recipes.launch import configure
 from nht.recipes.run.collecting import worker_seed
 from nht.recipes.run.record import Record
+from nht.recipes.run.workers import WorkerEndedError, Workers
 from nht.recipes.sections import CollectorConfig
 
 SETTINGS = ["algo.total_frames=400", "evaluation.every=400"]
@@ -184,6 +186,52 @@ def wait_for(condition, process):
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+class DeafCollector:
+    """Whose worker is a process that sleeps, and which waits for it to acknowledge weights, as TorchRL does."""
+
+    def __init__(self, worker):
+        self.procs = [worker]
+
+    def __iter__(self):
+        yield "batch"
+        raise OSError("a pipe of TorchRL's has broken")
+
+    def update_policy_weights_(self, policy):
+        threading.Event().wait()
+
+
+@pytest.fixture
+def sleeping():
+    worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(1000,))
+    worker.start()
+    yield worker
+    worker.kill()
+    worker.join()
+
+
+def test_a_workers_death_is_noticed_wherever_torchrl_waits(sleeping):
+    workers = Workers(DeafCollector(sleeping), torch.device("cpu"))
+    assert workers.next() == "batch"
+    threading.Timer(0.5, sleeping.kill).start()
+    with pytest.raises(WorkerEndedError, match=r"^collector: worker 0 was killed by SIGKILL\.$"):
+        workers.update(None)
+
+
+def test_the_reason_of_a_broken_pipe_is_told(sleeping):
+    workers = Workers(DeafCollector(sleeping), torch.device("cpu"))
+    assert workers.next() == "batch"
+    threading.Timer(0.5, sleeping.kill).start()
+    with pytest.raises(WorkerEndedError, match="was killed by SIGKILL"):
+        workers.next()
+
+
+def test_errors_that_have_nothing_to_do_with_death_are_passed_on(sleeping):
+    workers = Workers(DeafCollector(sleeping), torch.device("cpu"))
+    workers.next()
+    with pytest.raises(OSError, match="a pipe of TorchRL's has broken"):
+        workers.next()
 
 
 def test_seeds_of_workers_differ_and_repeat():

@@ -79,6 +79,7 @@ def test_told_to_end_between_two_evaluations(whole, number, tmp_path, monkeypatc
         count(self, data)
         if self.counters.frames == 500:
             os.kill(os.getpid(), number)
+            os.kill(os.getpid(), number)  # its echo: `timeout` tells the process and then its group
 
     with monkeypatch.context() as patched:
         patched.setattr(Record, "count_steps", tell)
