@@ -59,7 +59,7 @@ def as_text(schema: type[Any], word: str) -> str:
 
 
 def _listed(value: str) -> list[str]:
-    """The texts of a list, which commas outside of brackets divide; none if it holds quotes, or brackets do not match."""
+    """The texts of a list that commas outside of brackets divide; none if it holds quotes, or brackets do not match."""
     if not re.fullmatch(r"\[[^'\"\\]*\]", value, re.DOTALL) or not value[1:-1].strip():
         return []
     texts, open_brackets = [""], ""
