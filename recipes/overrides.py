@@ -13,12 +13,10 @@ from omegaconf.errors import GrammarParseError, InterpolationResolutionError, Om
 
 QUOTED = re.compile(r"'(\\.|[^'\\])*'|\"(\\.|[^\"\\])*\"", re.DOTALL)
 """Text that stands in quotes of Hydra's, from its first character to its last."""
-PLAIN_LIST = re.compile(r"\[([^][{}'\"\\]*)\]", re.DOTALL)
-"""A list of texts without quotes, brackets or backslashes: commas divide it, and nothing else in it means anything."""
 
 LIST_RULE = (
-    "Text in a list or mapping that holds = , ( ) [ ] { } or quotes stands in quotes, and the word in the shell's: "
-    "\"runs=['a [1]','b, c']\"."
+    "Text in a list or mapping that holds commas, brackets, = or quotes stands in quotes, and the word in the shell's: "
+    "\"runs=['a [1','b, c']\"."
 )
 REFERENCE_RULE = (
     r"${...} names another setting, ${oc.env:HOME} a variable of the environment; \${ stands for these characters "
@@ -54,11 +52,29 @@ def as_text(schema: type[Any], word: str) -> str:
     if not equals or QUOTED.fullmatch(value):
         return word
     kind = type_of(schema, key.lstrip("+"))
-    if kind in ("list[str]", "list[str] | None") and (found := PLAIN_LIST.fullmatch(value)):
-        texts = [text.strip() for text in found[1].split(",")]
-        return f"{key}=[{','.join(map(quoted, texts))}]" if found[1].strip() else word
+    if kind in ("list[str]", "list[str] | None") and (texts := _listed(value)):
+        return f"{key}=[{','.join(map(quoted, texts))}]"
     is_text = kind == "str" or (kind == "str | None" and value != "null")
     return f"{key}={quoted(value)}" if is_text else word
+
+
+def _listed(value: str) -> list[str]:
+    """The texts of a list that commas outside of brackets divide; none if it holds quotes, or brackets do not match."""
+    if not re.fullmatch(r"\[[^'\"\\]*\]", value, re.DOTALL) or not value[1:-1].strip():
+        return []
+    texts, open_brackets = [""], ""
+    for letter in value[1:-1]:
+        if letter == "," and not open_brackets:
+            texts.append("")
+            continue
+        texts[-1] += letter
+        if letter in "([{":
+            open_brackets += ")]}"["([{".index(letter)]
+        elif letter in ")]}":
+            if not open_brackets.endswith(letter):
+                return []
+            open_brackets = open_brackets[:-1]
+    return [] if open_brackets else [text.strip() for text in texts]
 
 
 def type_of(schema: type[Any], key: str) -> str | None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from netrc import NetrcParseError, netrc
 from pathlib import Path
@@ -17,6 +18,8 @@ from nht.reading import shortened
 from nht.recipes.run.metrics import FRAMES
 from nht.recipes.sections import RunConfig
 
+LONGEST_NAME = 128
+"""Characters in the name of an artifact."""
 SERVER = "https://api.wandb.ai"
 """W&B's own, unless ``WANDB_BASE_URL`` names another."""
 
@@ -64,7 +67,8 @@ class Dashboard:
         """Hand over the map, and the video if there is one."""
         if video.exists():
             self._run.log({"video": self._wandb.Video(str(video), format="mp4")})
-        artifact = self._wandb.Artifact(f"map-{self._folder.name}", type="action-map")
+        name = re.sub(r"[^A-Za-z0-9_.-]", "-", f"map-{self._folder.name}")  # what W&B allows
+        artifact = self._wandb.Artifact(name[:LONGEST_NAME], type="action-map")
         artifact.add_file(str(map_file))
         self._run.log_artifact(artifact)
         self._run.finish()

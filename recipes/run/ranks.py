@@ -16,6 +16,25 @@ PATIENCE = 60.0
 """Seconds that a rank has for a last checkpoint when torchrun has died."""
 
 
+def usable_device(device: torch.device | str) -> torch.device:
+    """The device of that name.
+
+    Raises:
+        ValueError: if there is no such device, or it is a GPU and PyTorch cannot use it.
+    """
+    try:
+        found = torch.device(device)
+    except RuntimeError as error:
+        raise ValueError(f"device={device} is none that PyTorch knows: cpu, cuda or cuda:1.") from error
+    if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
+        raise ValueError(
+            f"device={device} needs a GPU that PyTorch can use, and there is none: device=cpu."
+            if not torch.cuda.is_available()
+            else f"device={device} is not there: PyTorch sees {torch.cuda.device_count()} GPUs, counted from 0."
+        )
+    return found
+
+
 class Ranks:
     """This process among its fellows: what they average, add up and agree on. Alone, all of that does nothing.
 
@@ -40,11 +59,7 @@ class Ranks:
             torch.set_num_threads(threads)
         if seed is not None:
             torch.manual_seed(seed)
-        self.device = torch.device(device)
-        if self.device.type == "cuda" and not torch.cuda.is_available():
-            raise ValueError(
-                f"device={device} needs a GPU that PyTorch can use, and there is none: device=cpu."
-            )
+        self.device = usable_device(device)
         self.size = int(os.environ.get("WORLD_SIZE", "1"))
         self.rank = int(os.environ.get("RANK", "0")) if self.size > 1 else 0
         if self.size == 1:

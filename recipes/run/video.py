@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]
 
 TILE = (480, 360)  # width and height of one copy's picture [pixel]
 SMOOTH = 30  # frames per second that are enough
-MOST_FRAMES = 300  # of a film; of longer episodes fewer steps are filmed
+MOST_FRAMES = 201  # of a film: 200 steps and their start; of longer episodes fewer steps are filmed
 JERKY = 15  # frames per second; a film that would have fewer because steps are left out runs faster than time
 TRAIL_EVERY = 4  # steps; each piece of a line costs time in software rendering
 SHEET_COLUMNS = 6  # moments of an episode on the contact sheet

@@ -13,6 +13,7 @@ import pandas
 from nht.reading import entry, known_entries, read_json, shortened
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
+from nht.recipes.quiet import quiet_libraries
 from nht.recipes.run.metrics import EVERY_RUN
 from nht.recipes.run.metrics_file import metrics_table
 from nht.recipes.run.ownership import claimed
@@ -123,6 +124,7 @@ def _train(job: Job, run: Path) -> Ending:
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),
     ):
+        quiet_libraries()  # in this process, a worker's
         print(f"python -m nht.recipes.{job.recipe}", *overrides)
         try:
             algorithm.train(configure(algorithm.schema, job.recipe, overrides))

@@ -131,7 +131,10 @@ def test_disabled_writes_nothing(nobody, monkeypatch):
     assert list(nobody.iterdir()) == []
 
 
-def test_an_empty_key_does_not_stop_a_run(nobody, monkeypatch):
+@pytest.mark.parametrize("name", ["run", "lr=0.1, é (1)", "x" * 200])
+def test_an_empty_key_does_not_stop_a_run_whatever_its_folders_name(nobody, monkeypatch, name):
+    nobody = nobody / name
+    nobody.mkdir()
     monkeypatch.setenv("WANDB_API_KEY", "")
     dashboard = open_dashboard(nobody, {"seed": 3}, RunConfig())
     dashboard.log(10, {"eval_return": 1.0})

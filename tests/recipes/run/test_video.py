@@ -136,7 +136,7 @@ def filmed(steps, time_per_step):
 
 @pytest.mark.parametrize(
     ("steps", "time_per_step", "speed"),
-    [(1_000, 0.05, 3), (1_000, 0.01, 1), (200, 0.04, 1), (100, 0.5, 1), (10_000, 0.05, 26)],
+    [(1_000, 0.05, 4), (1_000, 0.01, 1), (200, 0.04, 1), (100, 0.5, 1), (10_000, 0.05, 38)],
 )
 def test_films_of_long_episodes_are_short(steps, time_per_step, speed):
     film, task = filmed(steps, time_per_step)
