@@ -166,7 +166,8 @@ def test_an_identity_until_told_otherwise_and_single_precision() -> None:
 def test_the_tool_follows_the_axes_of_a_map_trained_on_wam_wipe(tmp_path: Path) -> None:
     task = EnvConfig(context_keys=["tool_position", "joint_angle"], options={"start": "random"})
     demos = record_expert(task, DemosConfig(transitions=2000), 0, tmp_path / "demos")
-    settings, folder = MapConfig(hidden=[32], max_steps=500), DemosConfig(path=str(tmp_path / "demos"))
+    settings = MapConfig(hidden=[32], max_steps=500, action_scale=None)
+    folder = DemosConfig(path=str(tmp_path / "demos"))
     plain = train_map(settings, task, folder, 3).map
     aligned, metrics = train_map(settings, task, folder, 3, align="tool")
     assert isinstance(aligned, nht.Aligned)
@@ -191,8 +192,10 @@ def test_the_tool_follows_the_axes_of_a_map_trained_on_wam_wipe(tmp_path: Path) 
     corrected = nht.Residual(aligned, 0.1)
     for map in (aligned, corrected):  # what a run is told of its map's kind still holds
         file = nht.save_map(map, tmp_path / f"{type(map).__name__}.safetensors")
-        assert type(load_kind(file, "nht", residual=0.1)) is nht.Residual
-    assert type(load_kind(tmp_path / "Aligned.safetensors", "nht")) is nht.Aligned
+        assert type(load_kind(MapConfig("nht", str(file), residual=0.1))) is nht.Residual
+    found = load_kind(MapConfig("nht", str(tmp_path / "Aligned.safetensors")))
+    assert type(found) is nht.Aligned
+    assert torch.equal(found.action_scale, aligned.action_scale)
 
 
 # Bad input.

@@ -290,7 +290,7 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         nht.export_map(nht.SVD(7, 2), tmp_path / "map.onnx")
 
 
-def test_the_recipe_exports_with_the_scale_that_policies_are_trained_with(
+def test_the_recipe_exports_with_the_scale_of_the_map(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     map = nht.NHT(3, 4, 2, (16,))
@@ -300,7 +300,7 @@ def test_the_recipe_exports_with_the_scale_that_policies_are_trained_with(
     recipe.main(configure(ExportMap, "export_map", [f"file={saved}", f"out={out}"]))
     assert "action (batch, 2), context (batch, 3): ['joint_angle']" in capsys.readouterr().out
     action, context = some(map, 3)
-    torch.testing.assert_close(load(out)(action, context), map(action, context).detach())
+    torch.testing.assert_close(load(out)(action, context), map(3.0 * action, context).detach())
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def test_an_episode_equals_that_of_the_transform():
 def test_a_vector_equals_the_transform():
     options = {"seed": 3, "max_episode_steps": 15}
     batched = TransformedEnv(
-        make_env("wam_wipe", num_envs=3, seed=0, **options),
+        make_env("wam_wipe", num_envs=3, **options),
         ActionMapTransform(wipe_map(), WIPE_KEYS, action_scale=SCALE),
     )
     vector = gymnasium.make_vec(WIPE, num_envs=3, autoreset_mode=AutoresetMode.SAME_STEP, **options)
