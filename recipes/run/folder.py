@@ -108,6 +108,9 @@ class RunFolder:
                 f"{self.path} is being written by {owner_of(lock)}: wait, or choose another."
             )
         self._look()
+        if self.resuming and self.whole:  # nothing is left to do, and so nothing is written
+            self.close()
+            return
         motors = check_env(self.config.env)
         wanted(self.config.run)  # whether W&B is installed, if it is
         settings = self.path / CONFIG_FILE

@@ -15,7 +15,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 import fresh_process
 import tiny_runs
-from nht.recipes.run import checkpoints
+from nht.recipes.run import checkpoints, folder
 from nht.recipes.run.checkpoint_file import CheckpointFile, write_checkpoint
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.record import Record
@@ -90,6 +90,19 @@ def test_told_to_end_between_two_evaluations(whole, number, tmp_path, monkeypatc
     assert "was told to end: go on with run.resume=true" in capsys.readouterr().out
     assert (tmp_path / "run" / "checkpoints" / "checkpoint-000000000500.torchrl").exists()
     assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
+
+
+@pytest.mark.parametrize("resume", ["auto", "true", "false"])
+def test_a_run_that_is_whole_is_left_as_it_is(whole, resume, monkeypatch, capsys):
+    def refuse(*_):
+        raise AssertionError("a run on W&B was begun")
+
+    monkeypatch.setattr(folder, "open_dashboard", refuse)
+    before = {path: path.stat().st_mtime_ns for path in whole[1].rglob("*")}
+    told = [f"run.resume={resume}", "run.wandb=true", "algo.total_frames=300"]
+    pandas.testing.assert_frame_equal(train(whole[0], whole[1], *told), whole[2])
+    assert {path: path.stat().st_mtime_ns for path in whole[1].rglob("*")} == before
+    assert "policy.safetensors" in capsys.readouterr().out
 
 
 def broken_off(whole, folder: Path) -> list[Path]:
