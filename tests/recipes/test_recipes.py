@@ -196,7 +196,7 @@ def test_report_of_returns(run, tmp_path):
     out = tmp_path / "report"
     report.main(configure(Report, "report", [f"runs=[{folder}]", f"out={out}", "metric=return"]))
     last = f"{metrics['eval_return'].iloc[-1]:,.0f}"
-    assert f"| nht | 1 | 2000 | {last} | {last} .. {last} | {last} |" in (out / "table.md").read_text()
+    assert f"| nht | 1 | 2000 | {last} | {last} .. {last} | {last} |" in (out / "return-table.md").read_text()
     assert iio.imread(out / "return.png").ndim == 3
     with pytest.raises(ValueError, match="metric must be success or return, got 'reward'"):
         Report(metric="reward")
