@@ -139,7 +139,7 @@ def test_nothing_is_overwritten_or_guessed(compared: Path, common: list[str]) ->
     with pytest.raises(FileExistsError, match="never overwritten"):
         compare_maps.main(configure(CompareMaps, "compare_maps", [*common, f"out={compared}"]))
     for override, message in (
-        ("maps=[nht,pca]", r"unknown map kinds \['pca'\]: choose from \['cae', "),
+        ("maps=[nht,pca]", r"unknown map kind 'pca': choose from \['cae', "),
         ("maps=[]", r"nothing to compare: got maps=\[\]"),
         ("demos.path=null", r"demos.path must name the demonstrations"),
     ):

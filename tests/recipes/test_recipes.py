@@ -17,6 +17,8 @@ from nht.recipes.launch import configure
 from nht.recipes.maps.interface import load_kind
 from nht.recipes.maps.kinds import make_map, map_context_keys
 from nht.recipes.sections import MapConfig
+from nht.recipes.study.curves import summarise
+from nht.recipes.study.scores import interquartile_mean, interval
 
 TINY = [
     "algo.total_frames=2000",
@@ -186,7 +188,7 @@ def test_report_stops_where_a_seed_does():
     rows = [(0, 10, 0.2), (0, 20, 0.4), (0, 30, 1.0), (1, 10, 0.4), (1, 20, 0.6)]
     curves = pandas.DataFrame(rows, columns=["seed", "frames", "eval_success"])
     curves = curves.assign(interface="nht", eval_failure=0.0, eval_return=0.0, seconds=60.0)
-    (row,) = report.summarise(curves).to_dict("records")
+    (row,) = summarise(curves).to_dict("records")
     assert (row["seeds"], row["steps"], row["success"]) == (2, 20, "0.500")
     assert row["steps to 0.9"] == "1 of 2 seeds"
 
@@ -204,16 +206,16 @@ def test_report_of_returns(run, tmp_path):
 
 def test_report_interval_is_seeded_and_covers_the_mean():
     scores = torch.tensor([0.2, 0.4, 0.9, 0.95, 1.0], dtype=torch.float64).numpy()
-    low, high = report.interval(scores)
+    low, high = interval(scores)
     assert low < scores.mean() < high
-    assert report.interval(scores) == (low, high)
-    assert report.interval(scores[:1]) == (0.2, 0.2)
+    assert interval(scores) == (low, high)
+    assert interval(scores[:1]) == (0.2, 0.2)
 
 
 def test_interquartile_mean_leaves_out_the_best_and_the_worst_quarter():
     scores = torch.tensor([-100.0, 1.0, 2.0, 6.0, 1000.0], dtype=torch.float64).numpy()
-    assert report.interquartile_mean(scores) == 3.0
-    low, high = report.interval(scores, report.interquartile_mean)
+    assert interquartile_mean(scores) == 3.0
+    low, high = interval(scores, interquartile_mean)
     assert -100.0 < low < 3.0 < high < 1000.0
 
 
@@ -263,9 +265,8 @@ def test_a_map_of_another_kind(map_file, tmp_path):
 
 
 def test_demonstrations_of_another_env(demos, tmp_path):
-    shutil.copytree(demos, tmp_path / "demos")
-    manifest = tmp_path / "demos" / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"env": "wam_wipe"', '"env": "cheetah"'))
+    found = nht.load_demos(demos)
+    nht.save_demos(found.data, tmp_path / "demos", env="cheetah", seed=0, expert="unknown")
     with pytest.raises(ValueError, match=r"of env 'cheetah', expected 'wam_wipe'"):
         train_map.main(configure(TrainMap, "train_map", [f"demos.path={tmp_path / 'demos'}", "out=unused"]))
 
