@@ -97,16 +97,15 @@ class RunFolder:
         return [name.partition(":")[0] for name in names if ":" in name]
 
     def _begin(self, undo: ExitStack) -> None:
-        fresh = not self.path.exists()
         self.path.mkdir(parents=True, exist_ok=True)
-        if fresh:
-            undo.callback(shutil.rmtree, self.path, ignore_errors=True)
         lock = self.path / ".owner"
         undo.push(self._open)
         if not self._open.enter_context(claimed(lock)):
             raise FileExistsError(
                 f"{self.path} is being written by {owner_of(lock)}: wait, or choose another."
             )
+        if [entry.name for entry in self.path.iterdir()] == [lock.name]:  # ours alone to take away again
+            undo.callback(shutil.rmtree, self.path, ignore_errors=True)
         self._look()
         if self.resuming and self.whole:  # nothing is left to do, and so nothing is written
             self.close()
