@@ -136,8 +136,10 @@ def test_a_display_that_answers(monkeypatch, tmp_path):
     """Over TCP, as ssh forwards it, and by a socket in the file system's own names."""
     server = socket.create_server(("localhost", 0))
     monkeypatch.setenv("DISPLAY", f"localhost:{server.getsockname()[1] - 6000}.0")
-    threading.Thread(target=server.accept, daemon=True).start()
+    accepting = threading.Thread(target=server.accept, daemon=True)
+    accepting.start()
     assert rendering.display_answers()
+    accepting.join()  # a socket in use by a thread is not closed yet
     server.close()
     assert not rendering.display_answers()
     monkeypatch.delenv("DISPLAY")
