@@ -174,6 +174,6 @@ class ExportMap:
     low: list[float] | None = (
         None  # of each motor: then the program saturates as the map does; None is no limit
     )
-    high: list[float] | None = None
+    high: list[float] | None = None  # of each motor; None is no limit
     compiled: bool = False  # .pt2 only: machine code, for C++
     allow: list[str] = field(default_factory=list)  # packages whose classes the file may name
