@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -193,7 +193,6 @@ def _has_yaml(group: str, choice: str) -> bool:
 
 def _at_home(config: Any) -> Any:
     """A configuration in whose paths ``~`` is the user's home."""
-    changed: dict[str, Any] = {}
     for entry in fields(config):
         value = getattr(config, entry.name)
         if is_dataclass(value):
@@ -201,7 +200,7 @@ def _at_home(config: Any) -> Any:
         elif entry.metadata.get("path"):
             at_home = [os.path.expanduser(path) for path in value] if isinstance(value, list) else value
             setattr(config, entry.name, os.path.expanduser(value) if isinstance(value, str) else at_home)
-    return replace(config, **changed) if changed else config
+    return config
 
 
 def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
