@@ -26,10 +26,10 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import nht
 from nht.recipes.agents.ddpg import PaperDDPGLoss, networks
-from nht.recipes.agents.off_policy import JointSoftUpdate, exploring
+from nht.recipes.agents.off_policy import JointSoftUpdate, exploring, storable
 from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.config import DDPG
-from nht.recipes.ddpg import STORED, main
+from nht.recipes.ddpg import main
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import mapped_env
 
@@ -59,7 +59,7 @@ def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
     collected = next(batches).clone()
 
     def store() -> None:
-        buffer.extend(look_ahead(collected).reshape(-1).select(*STORED))
+        buffer.extend(storable(look_ahead(collected)))
 
     store()
     batch = buffer.sample()
