@@ -21,8 +21,8 @@ import torch
 from omegaconf import OmegaConf
 
 import nht
-from nht.recipes.sections import DemosConfig, EnvConfig
 from nht.recipes.data.recording import record_expert
+from nht.recipes.sections import DemosConfig, EnvConfig
 from nht.train import split_episodes
 
 LEAD = 0.2  # [s]

@@ -19,8 +19,8 @@ import torch
 from omegaconf import OmegaConf
 
 import nht
-from nht.recipes.sections import DemosConfig, EnvConfig
 from nht.recipes.data.recording import record_expert
+from nht.recipes.sections import DemosConfig, EnvConfig
 
 ACTION_DIMS = {"wam_wipe": 2, "wam_grasp": 3, "half_cheetah": 2}
 LIMITS = (None, 1.0, 0.3, 0.1)  # on the whole map
