@@ -31,6 +31,7 @@ from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.config import DDPG
 from nht.recipes.ddpg import main
 from nht.recipes.launch import configure
+from nht.recipes.maps.kinds import task_context_keys
 from nht.recipes.run.environments import mapped_env
 
 ROUNDS = 4
@@ -117,7 +118,7 @@ def benchmark() -> None:
     torch.set_num_threads(1)
     config = configure(DDPG, "ddpg")
     map = nht.NHT(10, 7, 2)
-    map.context_keys = tuple(config.env.context_keys)
+    map.context_keys = tuple(task_context_keys(config.env))
     updates = config.algo.updates_per_batch
     with tempfile.TemporaryDirectory() as scratch:
         map_file = nht.save_map(map, Path(scratch) / "map.safetensors")
