@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array, Flags
 from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
-from nht.envs.task import Array, Flags
 
 RUN_SPEED = 10.0
 """Speed of the centre of mass that is worth the full reward [m/s]."""

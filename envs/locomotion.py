@@ -15,7 +15,9 @@ from typing import ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import Array, BatchedTask, Flags, load_model
+from nht.envs.arrays import Array, Flags
+from nht.envs.models import load_model
+from nht.envs.task import BatchedTask
 
 Range = tuple[float, float]
 T = TypeVar("T")

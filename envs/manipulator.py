@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array, Flags
 from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
-from nht.envs.task import Array, Flags
 
 ARM = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist")
 FINGERS = ("finger", "fingertip", "thumb", "thumbtip")

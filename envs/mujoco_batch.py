@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
+from nht.envs.arrays import Rows
 from nht.envs.pictures import Pictures, check_mode
 from nht.envs.simulation import DEFAULT_SIZE
-from nht.envs.task import BatchedTask, Rows
+from nht.envs.task import BatchedTask
 from nht.envs.torchrl_internals import WholeSteps, packed
 
 

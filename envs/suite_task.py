@@ -8,7 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nht.envs.task import Array, BatchedTask, compile_model
+from nht.envs.arrays import Array
+from nht.envs.models import compile_model
+from nht.envs.task import BatchedTask
 
 
 class SuiteTask(BatchedTask):

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, Flags, load_model
+from nht.envs.arrays import Array, Flags
+from nht.envs.models import ASSETS, load_model
 from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, WAMTask, check_positive
 from nht.envs.wam_kinematics import damped_solve, forward_kinematics
 

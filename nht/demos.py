@@ -24,7 +24,7 @@ from nht.arrays import as_tensor
 from nht.episodes import check, items, key_name, listed, whole_episodes
 from nht.memmap import STORAGE, raw, read_tensordict, write_tensordict
 from nht.reading import checksum, entry, known_entries, read_json, shortened
-from nht.scratch import check_room, publish, scratch
+from nht.writing import check_room, publish, scratch
 
 FORMAT = "nht.demos"
 FORMAT_VERSION = 1

@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from nht.action_map import ActionMap
-from nht.storage import describe, replacing
+from nht.storage import describe
 from nht.torch_internals import write_machine_code
+from nht.writing import replacing
 
 SUFFIXES = (".pt2", ".onnx")
 

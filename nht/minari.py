@@ -26,7 +26,7 @@ from nht.minari_file import (
     local_datasets,
 )
 from nht.reading import naming, shortened, shown
-from nht.scratch import check_room, publish, scratch
+from nht.writing import check_room, publish, scratch
 
 if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset

@@ -24,7 +24,7 @@ from nht.action_map import ActionMap
 from nht.allowance import Allowance
 from nht.arguments import plain
 from nht.description import describe, of_version_1, twin
-from nht.replacing import replacing
+from nht.writing import replacing
 
 __all__ = ["check_storable", "describe", "load_map", "replacing", "save_map"]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nht.memmap import raw
 from nht.reading import plain_file, shortened, shown
-from nht.scratch import publish, scratch
+from nht.writing import publish, scratch
 
 CHECKSUM = "sha256"
 """In the header. It stands there alone: safetensors writes several entries in an order that changes."""

@@ -31,7 +31,8 @@ from nht.recipes.run.metrics_file import read_metrics
 from nht.recipes.run.ownership import claimed, owner_of
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import Training
-from nht.storage import format_version, replacing
+from nht.storage import format_version
+from nht.writing import replacing
 
 CONFIG_FILE, METRICS_FILE, WHOLE_FILE = "config.yaml", "metrics.csv", "whole.json"
 MAP_FILE, VIDEO_FILE = "map.safetensors", "video.mp4"
