@@ -208,6 +208,7 @@ class RunFolder:
             return
         if self._dashboard is not None:
             self._dashboard.finish(self.path / MAP_FILE, self.path / VIDEO_FILE)
+            self._dashboard = None
         with replacing(self.path / WHOLE_FILE) as scratch:
             scratch.write_text(json.dumps({FRAMES: frames}))
         self.show()
@@ -222,7 +223,10 @@ class RunFolder:
         print(f"\n{self.path}: " + ", ".join(shown))
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Let go of the folder, and of W&B's run if it did not get to its end."""
+        if self._dashboard is not None:
+            self._dashboard.leave()
+            self._dashboard = None
         self._open.close()
 
 
