@@ -28,7 +28,7 @@ from nht.recipes.run.dashboard import Dashboard, open_dashboard, wanted
 from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
 from nht.recipes.run.metrics_file import read_metrics
-from nht.recipes.run.ownership import claimed, owner_of
+from nht.recipes.run.ownership import OwnedError, claimed, owner_of
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import Training
 from nht.storage import format_version
@@ -102,9 +102,7 @@ class RunFolder:
         lock = self.path / ".owner"
         undo.push(self._open)
         if not self._open.enter_context(claimed(lock)):
-            raise FileExistsError(
-                f"{self.path} is being written by {owner_of(lock)}: wait, or choose another."
-            )
+            raise OwnedError(f"{self.path} is being written by {owner_of(lock)}: wait, or choose another.")
         if [entry.name for entry in self.path.iterdir()] == [lock.name]:  # ours alone to take away again
             undo.callback(shutil.rmtree, self.path, ignore_errors=True)
         self._look()
@@ -211,6 +209,7 @@ class RunFolder:
             return
         if self._dashboard is not None:
             self._dashboard.finish(self.path / MAP_FILE, self.path / VIDEO_FILE)
+            self._dashboard = None
         with replacing(self.path / WHOLE_FILE) as scratch:
             scratch.write_text(json.dumps({FRAMES: frames}))
         self.show()
@@ -225,7 +224,10 @@ class RunFolder:
         print(f"\n{self.path}: " + ", ".join(shown))
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Let go of the folder, and of W&B's run if it did not get to its end."""
+        if self._dashboard is not None:
+            self._dashboard.leave()
+            self._dashboard = None
         self._open.close()
 
 

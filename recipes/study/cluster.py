@@ -69,7 +69,8 @@ class Cluster:
                 ray.get(ready)
             except RayError as error:
                 reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
-                Ending("failed", reason).write(folder / job.name)
+                if Ending.read(folder / job.name) is None:  # it may have died after its work was done
+                    Ending("failed", reason).write(folder / job.name)
             yield job
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from nht.recipes.launch import configure
 from nht.recipes.quiet import quiet_libraries
 from nht.recipes.run.metrics import EVERY_RUN
 from nht.recipes.run.metrics_file import metrics_table
-from nht.recipes.run.ownership import claimed
+from nht.recipes.run.ownership import OwnedError, claimed
+from nht.recipes.run.workers import WorkerEndedError
 from nht.recipes.study.space import VERSION, Value
 from nht.storage import replacing
 
@@ -60,6 +62,9 @@ def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
 
 ENDINGS = ("done", "failed", "diverged")
 
+TRIES = 3
+"""How often a run is started whose workers die: that says nothing about what was drawn. Each goes on where it was."""
+
 
 @dataclass(frozen=True)
 class Ending:
@@ -100,7 +105,8 @@ def run_job(job: Job, folder: Path) -> Ending | None:
         folder: of the search.
 
     Returns:
-        the outcome, also of a run that had ended before; None if another process is at it.
+        the outcome, also of a run that had ended before; None if another process is at it, whether for this search or,
+        in the run's own folder, for a person.
     """
     run = folder / job.name
     if (outcome := Ending.read(run)) is not None:
@@ -109,13 +115,17 @@ def run_job(job: Job, folder: Path) -> Ending | None:
         if not ours:
             return None
         if (outcome := Ending.read(run)) is None:  # another process may have ended it in the meantime
-            outcome = _train(job, run)
+            try:
+                outcome = _train(job, run)
+            except OwnedError:
+                return None
             outcome.write(run)
             shutil.rmtree(run / "checkpoints", ignore_errors=True)  # buffers are large
     return outcome
 
 
 def _train(job: Job, run: Path) -> Ending:
+    """How the run came out; raises OwnedError if another process writes its folder."""
     run.mkdir(parents=True, exist_ok=True)
     algorithm = find_algorithm(job.recipe)
     overrides = [*job.overrides, f"run.folder={run}", "run.resume=auto"]
@@ -127,12 +137,26 @@ def _train(job: Job, run: Path) -> Ending:
         quiet_libraries()  # in this process, a worker's
         print(f"python -m nht.recipes.{job.recipe}", *overrides)
         try:
-            algorithm.train(configure(algorithm.schema, job.recipe, overrides))
+            _until_workers_live(lambda: algorithm.train(configure(algorithm.schema, job.recipe, overrides)))
+        except OwnedError as error:
+            print(error)
+            raise
         except FloatingPointError as error:
             return Ending("diverged", _line(error))
         except Exception as error:  # noqa: BLE001 - whatever it is, the other runs go on
             return Ending("failed", _line(error))
     return Ending("done")
+
+
+def _until_workers_live(train: Callable[[], None]) -> None:
+    """Train; again, a few times at most, if a collector's worker died."""
+    for left in reversed(range(TRIES)):
+        try:
+            return train()
+        except WorkerEndedError as error:
+            if not left:
+                raise
+            print(f"{error} Tried again, {left} times at most.")
 
 
 def _line(error: Exception) -> str:

@@ -15,8 +15,10 @@ from nht.recipes import search
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure
+from nht.recipes.run.ownership import claimed
+from nht.recipes.run.workers import WorkerEndedError
 from nht.recipes.study import cluster as cluster_module
-from nht.recipes.study.jobs import Ending, Job, rows_of, run_job
+from nht.recipes.study.jobs import TRIES, Ending, Job, rows_of, run_job
 
 BASE = [
     "evaluation.every=200",
@@ -192,6 +194,38 @@ def test_nobody_runs_what_another_one_is_at(recipe, tmp_path):
     assert run_job(job(), tmp_path) == Ending("done")
     assert outcomes == [None]
     assert len(recipe.configs) == 1
+
+
+def test_a_run_whose_workers_died_is_tried_again(recipe, tmp_path):
+    def die_once(config):
+        if len(recipe.configs) == 1:
+            raise WorkerEndedError("collector: worker 0 was killed by SIGKILL.")
+
+    recipe.act = die_once
+    assert run_job(job(), tmp_path) == Ending("done")
+    assert len(recipe.configs) == 2
+    assert recipe.configs[0] == recipe.configs[1]  # from its last checkpoint, by run.resume=auto
+    said = (tmp_path / job().name / "train.log").read_text()
+    assert "worker 0 was killed by SIGKILL. Tried again, 2 times at most." in said
+
+
+def test_a_run_whose_workers_always_die_fails_at_last(recipe, tmp_path):
+    def die(config):
+        raise WorkerEndedError("collector: worker 0 was killed by SIGKILL.")
+
+    recipe.act = die
+    ending = Ending("failed", "WorkerEndedError: collector: worker 0 was killed by SIGKILL.")
+    assert run_job(job(), tmp_path) == ending
+    assert len(recipe.configs) == TRIES
+
+
+def test_a_run_that_a_person_has_started_is_waited_for(tmp_path):
+    run = tmp_path / job().name
+    with claimed(run / ".owner"):
+        assert run_job(job(), tmp_path) is None
+        assert "is being written by process" in (run / "train.log").read_text()
+    assert Ending.read(run) is None
+    assert not list((tmp_path / "claims").iterdir())  # free for whoever comes next
 
 
 @pytest.mark.parametrize(
