@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.arrays import Array, Flags, Rows
+from nht.envs.arrays import Array, Flags, Rows, Seed
 from nht.envs.models import ASSETS, check_state, compile_model, load_model
 from nht.envs.outcome import OUTCOME_FLAGS, Outcome
 from nht.envs.physics import BatchedPhysics
@@ -24,7 +25,17 @@ if TYPE_CHECKING:
     from nht.envs.rendering import SceneRenderer
 
 # What a task of one's own is written with, beside BatchedTask.
-__all__ = ["ASSETS", "Array", "BatchedTask", "Flags", "Outcome", "Rows", "compile_model", "load_model"]
+__all__ = [
+    "ASSETS",
+    "Array",
+    "BatchedTask",
+    "Flags",
+    "Outcome",
+    "Rows",
+    "Seed",
+    "compile_model",
+    "load_model",
+]
 
 
 class BatchedTask(BatchedPhysics, ABC):
@@ -61,7 +72,7 @@ class BatchedTask(BatchedPhysics, ABC):
         substeps: int,
         max_episode_steps: int,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
     ) -> None:
         counts = {"num_envs": num_envs, "substeps": substeps, "num_threads": num_threads}
         for name, count in (counts | {"max_episode_steps": max_episode_steps}).items():
@@ -73,9 +84,20 @@ class BatchedTask(BatchedPhysics, ABC):
         self.steps: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
         self._flags: Flags = np.zeros((num_envs, len(OUTCOME_FLAGS)), dtype=bool)  # of each copy's last step
 
-    def seed(self, seed: int | None) -> None:
-        """Start the generator of all random draws anew; None takes a seed from the operating system."""
-        self.rng = np.random.default_rng(seed)
+    def seed(self, seed: Seed) -> None:
+        """Start the generator of all random draws anew; None takes a seed from the operating system.
+
+        Several seeds start a generator each, for equal numbers of copies in their order: what some draw does not depend
+        on the others.
+
+        Raises:
+            ValueError: if the copies cannot be shared alike.
+        """
+        seeds = seed if isinstance(seed, Sequence) else [seed]
+        if not seeds or self.num_envs % len(seeds):
+            raise ValueError(f"{len(seeds)} seeds cannot share num_envs={self.num_envs} copies alike.")
+        self._generators = [np.random.default_rng(each) for each in seeds]
+        self.rng = self._generators[0]
 
     # What a task adds.
 
@@ -117,7 +139,13 @@ class BatchedTask(BatchedPhysics, ABC):
         self.state[rows, 0] = self.model.opt.timestep
         self.steps[rows] = 0
         self._flags[rows] = False
-        self._draw_start(rows)
+        if len(self._generators) == 1:
+            self._draw_start(rows)
+            return
+        owners = rows // (self.num_envs // len(self._generators))
+        for owner in np.unique(owners):
+            self.rng = self._generators[owner]
+            self._draw_start(rows[owners == owner])
 
     def step(self, actuation: NDArray[np.floating[Any]], rows: Rows | None = None) -> Outcome:
         """Advance the copies ``rows`` (all by default) by one environment step, and leave the others alone.
@@ -214,14 +242,20 @@ class BatchedTask(BatchedPhysics, ABC):
     def state_dict(self) -> dict[str, Any]:
         """Everything a later ``load_state_dict`` needs to go on bit for bit: physics, episode and generator."""
         arrays = {name: getattr(self, name).copy() for name in ("state", "steps", *self._episode_arrays)}
-        return {**arrays, "flags": self._flags.copy(), "rng": self.rng.bit_generator.state}
+        states = [generator.bit_generator.state for generator in self._generators]
+        random = self.rng.bit_generator.state if len(states) == 1 else states
+        return {**arrays, "flags": self._flags.copy(), "rng": random}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Go on from what ``state_dict`` returned."""
         for name in ("state", "steps", *self._episode_arrays):
             getattr(self, name)[:] = saved[name]
         self._flags[:] = saved.get("flags", False)  # older files lack them
-        self.rng.bit_generator.state = saved["rng"]
+        if len(self._generators) == 1:
+            self.rng.bit_generator.state = saved["rng"]
+            return
+        for generator, state in zip(self._generators, saved["rng"], strict=True):
+            generator.bit_generator.state = state
 
     _episode_arrays: ClassVar[tuple[str, ...]] = ()
     """Names of the subclass's own per-copy arrays, each with N rows: saved, and kept where a copy stands still."""

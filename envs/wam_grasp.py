@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.arrays import Array, Flags
+from nht.envs.arrays import Array, Flags, Seed
 from nht.envs.models import ASSETS, load_model
 from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, WAMTask
 from nht.envs.wam_collision import ArmGeoms, Placed
@@ -67,7 +67,7 @@ class WAMGrasp(WAMTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         start_noise: float = 0.2,
         tilt_tolerance: float = math.pi / 16,
