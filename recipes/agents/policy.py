@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from tensordict.nn import TensorDictModule
-from torch import nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from nht.recipes.agents.policy_file import read_policy, write_policy
@@ -15,9 +16,9 @@ from nht.recipes.sections import Training
 POLICY_FILE = "policy.safetensors"
 
 
-def save_policy(policy: nn.Module, folder: Path) -> None:
-    """Write the deterministic policy, its normaliser included."""
-    write_policy(policy.state_dict(), folder / POLICY_FILE)
+def save_policy(state: Mapping[str, Tensor], folder: Path) -> None:
+    """Write the state of the deterministic policy, its normaliser included."""
+    write_policy(state, folder / POLICY_FILE)
 
 
 def load_policy(folder: Path, env: EnvBase, config: Training) -> TensorDictModule:

@@ -173,6 +173,36 @@ class RunFolder:
         except (OSError, ValueError, KeyError, TypeError):
             return False
 
+    @property
+    def members(self) -> list[RunFolder]:
+        """The folders of all learners: this one."""
+        return [self]
+
+    @property
+    def configs(self) -> list[Training]:
+        """The configurations of all learners."""
+        return [self.config]
+
+    @property
+    def maps(self) -> list[nht.ActionMap]:
+        """The action maps of all learners."""
+        return [self.map]
+
+    def finished(self) -> list[tuple[int, RunFolder]]:
+        """The learners that got to the end, with their numbers."""
+        return [(0, self)]
+
+    def log_each(self, frames: int, rows: Sequence[dict[str, float] | FloatingPointError]) -> None:
+        """Append the row of the only learner.
+
+        Raises:
+            FloatingPointError: if that is what there is in its place.
+        """
+        (row,) = rows
+        if isinstance(row, FloatingPointError):
+            raise row
+        self.log(frames, row)
+
     def log(self, frames: int, row: dict[str, float]) -> None:
         """Append a row to ``metrics.csv`` and send it to W&B, against environment steps."""
         if not self._ranks.first:
@@ -204,7 +234,7 @@ class RunFolder:
             csv.writer(file).writerows([heading, *kept])
 
     def finish(self, frames: int) -> None:
-        """Hand video and map to W&B, note that the run is whole, and show it."""
+        """Hand video and map to W&B, and note that the run is whole."""
         if not self._ranks.first:
             return
         if self._dashboard is not None:
@@ -212,7 +242,6 @@ class RunFolder:
             self._dashboard = None
         with replacing(self.path / WHOLE_FILE) as scratch:
             scratch.write_text(json.dumps({FRAMES: frames}))
-        self.show()
 
     def show(self) -> None:
         """Say what happened and where the files are."""
