@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -77,15 +77,16 @@ class Loop:
         self._signal: int | None = None
         self._told_at = 0.0  # by the clock that never goes back [s]
         ranks.part_ways(envs.seed)  # the networks are made, alike in all processes; exploration differs
-        self.collector: BaseCollector = make_collector(
-            config.collector,
-            envs.train,
-            envs.make,
-            policy,
-            frames_per_batch=many * ranks.share("algo.frames_per_batch", config.algo.frames_per_batch),
-            seed=envs.seed,
-            random_frames=many * random_frames // ranks.size,
-        )
+        with self._exploring():  # a collector tries the policy
+            self.collector: BaseCollector = make_collector(
+                config.collector,
+                envs.train,
+                envs.make,
+                policy,
+                frames_per_batch=many * ranks.share("algo.frames_per_batch", config.algo.frames_per_batch),
+                seed=envs.seed,
+                random_frames=many * random_frames // ranks.size,
+            )
         self._alone = isinstance(self.collector, Collector)
         simulation = envs.train.base_env.task
         if self._alone:
@@ -167,7 +168,7 @@ class Loop:
         if self._alone:
             batches = iter(self.collector)
             while not self._record.finished:
-                with self._learners.exploring() if self._learners is not None else nullcontext():
+                with self._exploring():
                     batch = next(batches)
                 yield batch
                 self._save_if_due()
@@ -180,6 +181,10 @@ class Loop:
             with self._saving():
                 workers.update(self._policy)
             self._save_if_due()
+
+    def _exploring(self) -> AbstractContextManager[Any]:
+        """Within, every learner draws from its own generator."""
+        return nullcontext() if self._learners is None else self._learners.exploring()
 
     @contextmanager
     def _saving(self) -> Iterator[None]:
