@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from nht.laser import CAE, LASER
     from nht.lipschitz import certificate, offset_certificate
     from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
-    from nht.minari import from_minari, to_minari
+    from nht.minari import from_minari
+    from nht.minari_writing import to_minari
     from nht.residual import Residual
     from nht.scl import SCL
     from nht.storage import load_map, save_map
@@ -35,7 +36,8 @@ _NAMES = {
     "laser": ("CAE", "LASER"),
     "lipschitz": ("certificate", "offset_certificate"),
     "maps": ("NHT", "SVD", "ActionMap", "Identity", "LinearActionMap"),
-    "minari": ("from_minari", "to_minari"),
+    "minari": ("from_minari",),
+    "minari_writing": ("to_minari",),
     "residual": ("Residual",),
     "scl": ("SCL",),
     "storage": ("load_map", "save_map"),
