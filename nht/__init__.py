@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nht.actuation_lipschitz import actuation_certificate
     from nht.alignment import Aligned, align
-    from nht.demos import Demos, load_demos, save_demos
+    from nht.demos import Demos
+    from nht.demos_folder import load_demos, save_demos
     from nht.export import export_map
     from nht.hdf5 import from_hdf5
     from nht.jacobian import JacobianPinv
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 _NAMES = {
     "actuation_lipschitz": ("actuation_certificate",),
     "alignment": ("Aligned", "align"),
-    "demos": ("Demos", "load_demos", "save_demos"),
+    "demos": ("Demos",),
+    "demos_folder": ("load_demos", "save_demos"),
     "export": ("export_map",),
     "hdf5": ("from_hdf5",),
     "jacobian": ("JacobianPinv",),

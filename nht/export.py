@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from nht.action_map import ActionMap
-from nht.storage import describe
+from nht.description import describe
 from nht.torch_internals import write_machine_code
 from nht.writing import replacing
 

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 import nht
 from nht.recipes.config import DemosConfig, EnvConfig
 from nht.recipes.recording import record_expert
-from nht.train import split_episodes
+from nht.training_data import split_episodes
 
 LEAD = 0.2  # [s]
 KINDS = ("svd", "scl", "nht")

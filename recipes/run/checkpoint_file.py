@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nht.memmap import DTYPES, META, PLAIN, STORAGE, file_name, raw
+from nht.memmap_files import DTYPES, META, PLAIN, STORAGE, file_name, raw
 from nht.reading import MAX_TEXT, checksum, entry, parse_json, plain_file, shortened
 from nht.recipes.run.state_json import decoded, encoded
 

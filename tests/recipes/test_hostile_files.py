@@ -17,7 +17,8 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
 import nht
-from nht.memmap import read_tensordict, write_tensordict
+from nht.memmap import read_tensordict
+from nht.memmap_files import write_tensordict
 from nht.recipes import collect_demos, inspect_demos
 from nht.recipes.agents.policy_file import read_policy, write_policy
 from nht.recipes.config import CollectDemos
