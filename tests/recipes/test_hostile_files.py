@@ -25,7 +25,7 @@ from nht.recipes.config import CollectDemos
 from nht.recipes.launch import configure
 from nht.recipes.run.checkpoint_file import CheckpointFile
 from nht.recipes.run.checkpoints import Checkpoints
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.saved_run import read_config
 from nht.recipes.run.statistics import Counters
 from toy_demos import demonstrations, episodes, write_hdf5
 from untouched import only_reads
