@@ -114,10 +114,9 @@ class Attachment(EarlyReader):
             spec[self.context_key] = Unbounded(self._context_shape, dtype=self.dtype, device=spec.device)
         return spec
 
-    def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """TorchRL calls this before a reset, as it calls ``inv`` before a step."""
+    def before_reset(self) -> None:
+        """Looks around again, if the chain has changed since."""
         self._check_place()
-        return super()._reset_env_preprocess(tensordict)
 
     def _check_place(self) -> None:
         """Looks around again, if the chain has changed since. To be called before the environment is."""

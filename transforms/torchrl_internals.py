@@ -25,6 +25,14 @@ class EarlyReader(Transform):
         """Reads what the environment returned, and may add entries to it."""
         raise NotImplementedError
 
+    def before_reset(self) -> None:
+        """Called before the environment is reset; by default nothing."""
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Relies on ``TransformedEnv`` calling this before a reset, as it calls ``inv`` before a step."""
+        self.before_reset()
+        return super()._reset_env_preprocess(tensordict)
+
 
 def containers(transform: Transform) -> Iterator[Compose | EnvBase]:
     """What is around a transform, from the innermost Compose to the environment, as far as there is one.
