@@ -88,7 +88,7 @@ class OutcomeFlags(Transform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Registers the flags: collectors drop what is not in the specs."""
+        """Register the flags: collectors drop what is not in the specs."""
         shape = (*observation_spec.shape, 1)
         for name in FLAGS:
             if name not in list(observation_spec.keys()):

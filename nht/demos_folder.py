@@ -18,6 +18,7 @@ from nht.episodes import items
 from nht.manifest import MANIFEST, described, manifest_of, manifest_text, read_manifest
 from nht.memmap import read_tensordict
 from nht.memmap_files import STORAGE, write_tensordict
+from nht.reading import shortened
 from nht.writing import check_room, publish, scratch
 
 
@@ -30,7 +31,7 @@ def save_demos(
     expert: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Demos:
-    """Writes demonstrations to a new folder, all or nothing.
+    """Write demonstrations to a new folder, all or nothing.
 
     Args:
         data: (T,) transitions in order of time: "actuation" (T, n), "episode" (T,) int64, and every raw key
@@ -77,7 +78,7 @@ def save_demos(
 
 
 def load_demos(path: str | Path, *, env: str | None = None) -> Demos:
-    """Opens a folder that ``save_demos`` wrote; the data stay on disk until read. Nothing is unpickled.
+    """Open a folder that ``save_demos`` wrote; the data stay on disk until read. Nothing is unpickled.
 
     Args:
         path: the folder.
@@ -94,7 +95,7 @@ def load_demos(path: str | Path, *, env: str | None = None) -> Demos:
     try:
         data = read_tensordict(path / "data")
     except (OSError, ValueError) as error:
-        raise ValueError(f"the data of {path} cannot be read: {error}") from error
+        raise ValueError(f"the data of {path} cannot be read: {shortened(error, 600)}.") from error
     if described(data) != {name: manifest[name] for name in described(data)}:
         raise ValueError(f"the data of {path} are not those of its manifest: they were changed or cut short.")
     return Demos(immutable_buffer(data), manifest)

@@ -33,7 +33,7 @@ def export_map(
     high: Limits | None = None,
     compiled: bool = False,
 ) -> Path:
-    """Writes what a policy's action in [-1, 1]^k does: ``map.decode(action, context, low, high)``.
+    """Write what a policy's action in [-1, 1]^k does: ``map.decode(action, context, low, high)``.
 
     Inputs, in this order: "action" (batch, k) and "context" (batch, context_dim, which may be 0); output: "actuation"
     (batch, n). All are in the map's precision, and for any batch. Without limits, what happens at the robot's is left

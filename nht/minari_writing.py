@@ -23,6 +23,7 @@ from nht.minari_internals import (
     episode_buffer,
     import_minari,
 )
+from nht.reading import shortened
 from nht.writing import check_room, publish, scratch
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def to_minari(
     env: str | None = None,
     observation_keys: Sequence[str] | None = None,
 ) -> MinariDataset:
-    """Writes demonstrations as a new local Minari dataset, all or nothing.
+    """Write demonstrations as a new local Minari dataset, all or nothing.
 
     Minari decides where: in the folder that the environment variable MINARI_DATASETS_PATH names, else in the
     user's home. Author, licence and the like can be added by ``dataset.storage.update_metadata``.
@@ -82,7 +83,7 @@ def to_minari(
                 moments_of(dataset, episode)
         except UNREADABLE as error:
             raise ValueError(
-                f"the demonstrations cannot be written as a dataset of env {env}: {error}"
+                f"the demonstrations cannot be written as a dataset of env {env}: {shortened(error, 600)}."
             ) from error
         publish(root / dataset_id, folder)
         for about_namespace in root.rglob(NAMESPACE):

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from nht.action_map import ActionMap
 from nht.arguments import plain
+from nht.reading import shortened
 
 
 @torch.no_grad()
 def check_storable(map: ActionMap) -> ActionMap:
-    """Builds the twin that a file of this map would give, so that what cannot be saved shows before it is trained.
+    """Build the twin that a file of this map would give, so that what cannot be saved shows before it is trained.
 
     Returns:
         The twin: constructed alike, not trained.
@@ -28,7 +29,9 @@ def check_storable(map: ActionMap) -> ActionMap:
     try:
         other = type(map)(*map.init_positional(), **map.init_args())
     except Exception as error:  # of a constructor of any kind
-        raise ValueError(f"{refused}: {given} raise {type(error).__name__}: {error}") from error
+        raise ValueError(
+            f"{refused}: {given} raise {type(error).__name__}: {shortened(error, 600)}."
+        ) from error
     if (again := _listed(other)) != given:
         raise ValueError(
             f"{refused}: an attribute named like an argument of the constructor must be that argument, but "

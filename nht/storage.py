@@ -34,7 +34,7 @@ LONGEST_REASON = 600  # characters of what an error says about a file
 
 
 def save_map(map: ActionMap, path: str | Path) -> Path:
-    """Writes a map to one file; a reader sees the old file or the whole new one, never a part.
+    """Write a map to one file; a reader sees the old file or the whole new one, never a part.
 
     Normaliser, scale and bounds are buffers and therefore among the weights. The header has the class, by module and
     name, the constructor's arguments, the context's keys in order and the saturation; for whoever reads only the header
@@ -60,7 +60,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
 
 
 def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Sequence[str] = ()) -> ActionMap:
-    """Reads a map, ready to use: in eval mode, its parameters without gradients.
+    """Read a map, ready to use: in eval mode, its parameters without gradients.
 
     A class of your own is found if its module is imported, or is, or lies in, one of those in ``allow``, which are then
     imported. Files of format version 1 load as they did; they clip actuations.
@@ -141,7 +141,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
 
 def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
-    """Loads the weights, all of them and no others, in the precision they were saved in."""
+    """Load the weights, all of them and no others, in the precision they were saved in."""
     name, untrained = type(map).__name__, map.state_dict()
     if untrained.keys() != tensors.keys():
         raise ValueError(

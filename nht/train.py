@@ -51,7 +51,7 @@ def train_map(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> MapTraining:
-    """Trains a map in place, on its own device, and keeps the weights that were best on held-out episodes.
+    """Train a map in place, on its own device, and keep the weights that were best on held-out episodes.
 
     If ``map.fit`` is no closed form, Adam follows ``map.loss``, with a learning rate that falls to 0 along a
     cosine. The map also learns its context keys, action scale, bounds and the fingerprint of the data.
@@ -127,7 +127,7 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
 def _gradient_steps(
     map: ActionMap, data: TensorDictBase, batch_size: int, learning_rate: float, max_steps: int, seed: int
 ) -> Iterator[tuple[int, float]]:
-    """Yields step and loss every EVALUATE_EVERY steps, when the map is exactly within its limit."""
+    """Yield step and loss every EVALUATE_EVERY steps, when the map is exactly within its limit."""
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(map.parameters(), lr=learning_rate, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max_steps)
@@ -151,7 +151,7 @@ def _gradient_steps(
 def _batches(
     data: TensorDictBase, batch_size: int, count: int, generator: torch.Generator
 ) -> Iterator[TensorDictBase]:
-    """Yields batches of random rows; those of many steps are gathered at once, as each gathering has its price."""
+    """Yield batches of random rows; those of many steps are gathered at once, as each gathering has its price."""
     for start in range(0, count, EVALUATE_EVERY):
         steps = min(EVALUATE_EVERY, count - start)
         rows = torch.randint(len(data), (steps, batch_size), generator=generator)
@@ -165,7 +165,7 @@ def _keep_best(
     patience: int,
     progress: Progress | None,
 ) -> tuple[int, int]:
-    """Trains until the validation error stops falling: the steps made, and the step of the best weights."""
+    """Train until the validation error stops falling: the steps made, and the step of the best weights."""
     start = time.perf_counter()
     # The start counts, too: a map that starts at the best plane never ends below it.
     best_error, best_step, step = projection_error(map, validation["context"], validation["actuation"]), 0, 0

@@ -15,7 +15,7 @@ RANK_TOLERANCE = 1e-5  # actuations' singular values below this share of the lar
 
 
 def split_episodes(episode: Tensor, share: float, seed: int) -> Tensor:
-    """Holds out a share of the episodes, at least one, never all: (T,) -> (T,) bool, true where held out.
+    """Hold out a share of the episodes, at least one, never all: (T,) -> (T,) bool, true where held out.
 
     Of a single episode its last steps are held out: neighbours in time are too alike to be drawn at random.
     """

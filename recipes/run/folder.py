@@ -105,7 +105,7 @@ class RunFolder:
         self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
 
     def _look(self) -> None:
-        """Finds out whether a run is to go on here, and whether it may."""
+        """Find out whether a run is to go on here, and whether it may."""
         settings, run = self.path / CONFIG_FILE, self.config.run
         resume = run.resume or ("auto" if self._ranks.restarts else False)  # torchrun starts processes anew
         self.resuming = settings.exists()
