@@ -24,7 +24,7 @@ import nht
 from nht.recipes.data.recording import record_expert
 from nht.recipes.maps.kinds import task_context_keys
 from nht.recipes.sections import DemosConfig, EnvConfig
-from nht.train import split_episodes
+from nht.training_data import split_episodes
 
 LEAD = 0.2  # [s]
 KINDS = ("svd", "scl", "nht")

@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from nht.memmap import raw
+from nht.memmap_files import raw
 from nht.reading import plain_file, shortened, shown
 from nht.writing import publish, scratch
 

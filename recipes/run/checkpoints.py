@@ -13,7 +13,8 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
 from nht.reading import shortened, shown
-from nht.recipes.run.checkpoint_file import CheckpointFile, size_of, write_checkpoint
+from nht.recipes.run.checkpoint_file import CheckpointFile
+from nht.recipes.run.checkpoint_writing import size_of, write_checkpoint
 from nht.writing import check_room, publish, remove_leftovers, scratch
 
 NAME = re.compile(r"checkpoint-(\d{1,18})\.torchrl")

@@ -16,7 +16,8 @@ from torchrl.data import ReplayBuffer
 
 import fresh_process
 import nht
-from nht.demos import Demos, load_demos, save_demos
+from nht.demos import Demos
+from nht.demos_folder import load_demos, save_demos
 from nht.reading import checksum
 from nht.writing import scratch
 

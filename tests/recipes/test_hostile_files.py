@@ -17,14 +17,15 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
 import nht
-from nht.memmap import read_tensordict, write_tensordict
+from nht.memmap import read_tensordict
+from nht.memmap_files import write_tensordict
 from nht.recipes import collect_demos, inspect_demos
 from nht.recipes.agents.policy_file import read_policy, write_policy
 from nht.recipes.config import CollectDemos
 from nht.recipes.launch import configure
 from nht.recipes.run.checkpoint_file import CheckpointFile
 from nht.recipes.run.checkpoints import Checkpoints
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.saved_run import read_config
 from nht.recipes.run.statistics import Counters
 from toy_demos import demonstrations, episodes, write_hdf5
 from untouched import only_reads
