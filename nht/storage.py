@@ -26,7 +26,7 @@ from nht.description import describe, of_version_1, twin
 from nht.storable import check_storable, state_of
 from nht.writing import replacing
 
-__all__ = ["format_version", "load_map", "replacing", "save_map"]
+__all__ = ["format_version", "load_map", "save_map"]
 
 FORMAT = "nht.action_map"
 FORMAT_VERSION = 2

@@ -28,7 +28,7 @@ from nht.recipes.study.report import summary
 from nht.recipes.study.results import SearchResults, read_results
 from nht.recipes.study.rows_file import COLUMNS
 from nht.recipes.study.space import draw, write_manifest
-from nht.storage import replacing
+from nht.writing import replacing
 
 if TYPE_CHECKING:
     from nht.recipes.study.cluster import Cluster

@@ -20,7 +20,7 @@ from nht.recipes.run.metrics_file import metrics_table
 from nht.recipes.run.ownership import OwnedError, claimed
 from nht.recipes.run.workers import WorkerEndedError
 from nht.recipes.study.space import VERSION, Value
-from nht.storage import replacing
+from nht.writing import replacing
 
 
 @dataclass(frozen=True)
