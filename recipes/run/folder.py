@@ -31,6 +31,8 @@ from nht.recipes.sections import Training
 from nht.writing import replacing
 
 METRICS_FILE, WHOLE_FILE, VIDEO_FILE = "metrics.csv", "whole.json", "video.mp4"
+MAP_METRICS_FILE = "map.json"
+"""What the training of the run's map gave, if it trained one."""
 
 
 class RunFolder:
@@ -98,8 +100,11 @@ class RunFolder:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
         if not (kept := self.path / MAP_FILE).exists():
-            map = run_map(self.config, motors)
+            map, found = run_map(self.config, motors)
             mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
+            if found:
+                with replacing(self.path / MAP_METRICS_FILE) as scratch:
+                    scratch.write_text(json.dumps(found))
             nht.save_map(map, kept)
         self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
 

@@ -8,6 +8,7 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
@@ -19,6 +20,9 @@ except ImportError as error:
     raise ImportError("searches need Ray: pip install 'nht[search]'.") from error
 
 from nht.recipes.study.jobs import Ending, Job
+from nht.recipes.study.packs import Pack
+
+Work = TypeVar("Work", Job, Pack)
 
 ANSWER = 15.0
 """Seconds within which a cluster must answer."""
@@ -54,28 +58,34 @@ class Cluster:
             raise
 
     def run(
-        self, work: Callable[[Job, Path], Ending | None], jobs: Sequence[Job], folder: Path
-    ) -> Iterator[Job]:
-        """Do ``work(job, folder)`` for all jobs, one core each, and give each back once it is done.
+        self, work: Callable[[Work, Path], object], tasks: Sequence[Work], folder: Path
+    ) -> Iterator[Work]:
+        """Do ``work(task, folder)`` for all tasks, one core each, and give each back once it is done.
 
-        A job whose worker dies is tried again, three times; then it is recorded as failed.
+        A task whose worker dies is tried again, three times; then its runs are recorded as failed. Those that are told
+        ``device=cuda`` get a GPU.
         """
         remote = ray.remote(num_cpus=1, max_retries=3)(work)
-        waiting = {remote.remote(job, folder): job for job in jobs}
+        waiting = {remote.options(num_gpus=_gpus(task)).remote(task, folder): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting), num_returns=1)
-            job = waiting.pop(ready)
+            task = waiting.pop(ready)
             try:
                 ray.get(ready)
             except RayError as error:
                 reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
-                if Ending.read(folder / job.name) is None:  # it may have died after its work was done
-                    Ending("failed", reason).write(folder / job.name)
-            yield job
+                for job in task.jobs:
+                    if Ending.read(folder / job.name) is None:  # it may have died after its work was done
+                        Ending("failed", reason).write(folder / job.name)
+            yield task
 
     def close(self) -> None:
         """End the workers of this machine, or leave the cluster."""
         ray.shutdown()
+
+
+def _gpus(task: Job | Pack) -> int:
+    return int(any(word.startswith("device=cuda") for word in task.jobs[0].overrides))
 
 
 def _check_answer(address: str) -> None:

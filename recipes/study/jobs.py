@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import pandas
 
-from nht.reading import entry, known_entries, read_json, shortened
+from nht.reading import entry, known_entries, read_json, shortened, shown
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.quiet import quiet_libraries
+from nht.recipes.run.folder import MAP_METRICS_FILE
 from nht.recipes.run.metrics import EVERY_RUN
 from nht.recipes.run.metrics_file import metrics_table
 from nht.recipes.run.ownership import OwnedError, claimed
 from nht.recipes.run.workers import WorkerEndedError
+from nht.recipes.study.rows_file import CORE_SECONDS, MAP_ERROR
 from nht.recipes.study.space import VERSION, Value
 from nht.writing import replacing
 
@@ -54,6 +58,11 @@ class Job:
         """Of the run's folder, below the search's."""
         return job_name(self.stage, self.interface, self.configuration, self.seed)
 
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """The runs that are done together: this one."""
+        return (self,)
+
 
 def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
     """The name of a run, and of its folder below the search's."""
@@ -68,10 +77,17 @@ TRIES = 3
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run came out: ``done``, ``failed`` or ``diverged``, and why."""
+    """How a run came out.
+
+    Attributes:
+        status: ``done``, ``failed`` or ``diverged``.
+        reason: why.
+        core_seconds: processor time of the process that ended it, its share of it if several runs trained together [s].
+    """
 
     status: str
     reason: str = ""
+    core_seconds: float | None = field(default=None, compare=False)
 
     @classmethod
     def read(cls, run: Path) -> Ending | None:
@@ -84,17 +100,22 @@ class Ending:
         if not file.exists():
             return None
         record = read_json(file)
-        known_entries(record, ("status", "reason"), str(file))
+        known_entries(record, ("status", "reason", "core_seconds"), str(file))
         if entry(record, "status", str, str(file)) not in ENDINGS:
             raise ValueError(
                 f"{file}: 'status' must be one of {list(ENDINGS)}, got {shortened(record['status'], 60)!r}."
             )
-        return cls(record["status"], entry(record, "reason", str, str(file)))
+        spent = record.get("core_seconds")
+        if not (spent is None or (isinstance(spent, int | float) and 0 <= spent < math.inf)):
+            raise ValueError(
+                f"{file}: 'core_seconds' must be a finite number, at least 0, got {shown(spent)}."
+            )
+        return cls(record["status"], entry(record, "reason", str, str(file)), spent)
 
     def write(self, run: Path) -> None:
         """Record it in the run's folder."""
         with replacing(run / "outcome.json") as scratch:
-            scratch.write_text(json.dumps({"status": self.status, "reason": self.reason}))
+            scratch.write_text(json.dumps(asdict(self)))
 
 
 def run_job(job: Job, folder: Path) -> Ending | None:
@@ -115,10 +136,12 @@ def run_job(job: Job, folder: Path) -> Ending | None:
         if not ours:
             return None
         if (outcome := Ending.read(run)) is None:  # another process may have ended it in the meantime
+            begun = time.process_time()
             try:
                 outcome = _train(job, run)
             except OwnedError:
                 return None
+            outcome = replace(outcome, core_seconds=time.process_time() - begun)
             outcome.write(run)
             shutil.rmtree(run / "checkpoints", ignore_errors=True)  # buffers are large
     return outcome
@@ -186,4 +209,15 @@ def rows_of(job: Job, folder: Path) -> pandas.DataFrame:
     }
     for place, (name, value) in enumerate(known.items()):
         rows.insert(place, name, value)
-    return rows.assign(**job.parameters)
+    costs = {CORE_SECONDS: outcome.core_seconds, MAP_ERROR: map_error(run)}
+    return rows.assign(
+        **{name: float("nan") if cost is None else cost for name, cost in costs.items()}, **job.parameters
+    )
+
+
+def map_error(run: Path) -> float | None:
+    """The held-out error of the map that a run trained; None if it trained none."""
+    file = run / MAP_METRICS_FILE
+    if not file.exists():
+        return None
+    return float(entry(read_json(file), "validation_error", float, str(file)))
