@@ -19,6 +19,7 @@ import numpy as np
 from mujoco import rollout
 from numpy.typing import NDArray
 
+from nht.envs.mujoco_log import warnings_logged
 from nht.envs.simulation import DEFAULT_SIZE
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ Rows = NDArray[np.intp]
 """Indices of copies."""
 
 ASSETS = Path(__file__).parent / "assets"
-LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -173,6 +173,7 @@ class BatchedTask(ABC):
 
     # What every task shares.
 
+    @warnings_logged()
     def reset(self, rows: Rows | None = None) -> None:
         """Start a new episode in the copies ``rows`` (all by default) and leave the others alone."""
         self._check_open()
@@ -186,6 +187,7 @@ class BatchedTask(ABC):
         self._flags[rows] = False
         self._draw_start(rows)
 
+    @warnings_logged()
     def step(self, actuation: NDArray[np.floating[Any]], rows: Rows | None = None) -> Outcome:
         """Advance the copies ``rows`` (all by default) by one environment step, and leave the others alone.
 
@@ -393,19 +395,16 @@ def load_model(path: Path) -> mujoco.MjModel:
 def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjModel:
     """What ``build`` compiles.
 
-    MuJoCo's warnings, which it would also write to a file in the working folder, go to this module's logger.
+    MuJoCo's warnings go to the log, as mere information: the model is no work of whoever asks for it.
 
     Raises:
         ValueError: if it does not compile: the name, and MuJoCo's message.
     """
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(LOGGER.info)
     try:
-        return build()
+        with warnings_logged(logging.INFO, others=True):
+            return build()
     except ValueError as error:
         raise ValueError(f"{name} does not compile: {error}") from error
-    finally:
-        mujoco.set_mju_user_warning(previous)
 
 
 def _check_limits(model: mujoco.MjModel, qpos: Array, tolerance: float) -> None:
