@@ -73,7 +73,7 @@ LAYERS = {
     "nht.linear_map": 2,
     "nht.maps": 3,
     "nht.lipschitz": 5,
-    "nht.replacing": 0,
+    "nht.replacing": 1,
     "nht.actuation_lipschitz": 6,
     "nht.map_classes": 5,
     "nht.description": 6,
