@@ -8,6 +8,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 import nht
+from nht.envs import make_env
+from nht.envs.rendering import coarse_shadows
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.video import (
@@ -146,3 +148,30 @@ def test_films_of_long_episodes_are_short(steps, time_per_step, speed):
     assert film.frames_per_second >= min(JERKY, 1 / time_per_step)
     seconds = steps * time_per_step / speed
     assert len(film.frames) / film.frames_per_second == pytest.approx(seconds, rel=0.03)
+
+
+@pytest.mark.usefixtures("can_render")
+def test_coarse_shadows_leave_the_model_and_other_renderers_alone():
+    task = wipe().base_env.task
+    quality, screen = task.model.vis.quality, task.model.vis.global_
+    before = quality.shadowsize, screen.offwidth, screen.offheight
+    plain = task.renderer(64, 48)
+    with coarse_shadows(16):
+        coarse = task.renderer(64, 48)
+        assert (quality.shadowsize, screen.offwidth, screen.offheight) == before
+    again = task.renderer(64, 48)
+    pictures = [renderer.frame(0) for renderer in (plain, coarse, again)]
+    np.testing.assert_array_equal(pictures[0], pictures[2])
+    differing = (pictures[0] != pictures[1]).any(-1).mean()
+    assert 0 < differing < 0.1  # nothing but the edges of shadows
+    for renderer in (plain, coarse, again):
+        renderer.close()
+
+
+@pytest.mark.usefixtures("can_render")
+def test_a_picture_may_be_larger_than_the_models_own_buffer():
+    task = make_env("half_cheetah", seed=0).task
+    assert task.model.vis.global_.offwidth < 800
+    renderer = task.renderer(800, 600)
+    assert renderer.frame(0).shape == (600, 800, 3)
+    renderer.close()
