@@ -13,11 +13,12 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 try:
     import ray
-    from ray.exceptions import RayError
+    from ray.exceptions import OutOfMemoryError, RayError, RayTaskError, WorkerCrashedError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 except ImportError as error:
     raise ImportError("searches need Ray: pip install 'nht[search]'.") from error
 
+from nht.reading import shortened
 from nht.recipes.study.jobs import Ending, Job
 
 ANSWER = 15.0
@@ -59,6 +60,9 @@ class Cluster:
         """Do ``work(job, folder)`` for all jobs, one core each, and give each back once it is done.
 
         A job whose worker dies is tried again, three times; then it is recorded as failed.
+
+        Raises:
+            RuntimeError: if Ray itself fails, or a job can be neither begun nor recorded: that is no result of a job's.
         """
         remote = ray.remote(num_cpus=1, max_retries=3)(work)
         waiting = {remote.remote(job, folder): job for job in jobs}
@@ -67,15 +71,24 @@ class Cluster:
             job = waiting.pop(ready)
             try:
                 ray.get(ready)
-            except RayError as error:
-                reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            except (WorkerCrashedError, OutOfMemoryError) as error:
                 if Ending.read(folder / job.name) is None:  # it may have died after its work was done
-                    Ending("failed", reason).write(folder / job.name)
+                    Ending("failed", _reason(error)).write(folder / job.name)
+            except RayError as error:
+                raise RuntimeError(
+                    f"{folder}: the run {job.name} is not finished: {_reason(error)}. Start the same command again: "
+                    "what was finished is kept."
+                ) from error
             yield job
 
     def close(self) -> None:
         """End the workers of this machine, or leave the cluster."""
         ray.shutdown()
+
+
+def _reason(error: RayError) -> str:
+    cause = error.cause if isinstance(error, RayTaskError) else error
+    return f"{type(cause).__name__}: {shortened(cause)}"
 
 
 def _check_answer(address: str) -> None:

@@ -39,7 +39,7 @@ def finish(folder, overrides):
 
 
 def kill_after(seconds, victim, folder, overrides):
-    """Kill the ``search``, or all its ``worker`` processes once; whether there was anything to kill.
+    """Kill the ``search``, or once all processes of Ray's that work for it; whether there was anything to kill.
 
     Nobody is waited for: what the search has started may outlive it for a while.
     """
@@ -55,7 +55,8 @@ def kill_after(seconds, victim, folder, overrides):
     for number in found:
         os.kill(number, signal.SIGKILL)
     process.join()
-    assert process.exitcode == 0, killed_runs.words(folder)
+    if process.exitcode != 0:  # where Ray has not outlived it, it says so
+        assert "Start the same command again" in killed_runs.words(folder), killed_runs.words(folder)
     return bool(found)
 
 

@@ -297,6 +297,32 @@ def test_on_ray_stopped_and_gone_on(tmp_path):
 
 
 @pytest.mark.slow
+def test_what_is_no_fault_of_a_run_is_not_recorded_as_one(tmp_path):
+    """Ray's own failures, and runs that cannot even be recorded."""
+    cluster = cluster_module.Cluster(num_workers=1)
+    try:
+        with pytest.raises(
+            RuntimeError, match=r"is not finished: OSError: no room.*Start the same command again"
+        ):
+            list(cluster.run(refuse, [job()], tmp_path))
+        with pytest.raises(RuntimeError, match=r"is not finished: \w+Error: .*Start the same command again"):
+            list(cluster.run(end_ray, [job()], tmp_path))
+    finally:
+        cluster.close()
+    assert Ending.read(tmp_path / job().name) is None
+
+
+def refuse(run, folder):
+    raise OSError("no room")
+
+
+def end_ray(run, folder):
+    """Kill the process that looks after this one."""
+    os.kill(os.getppid(), signal.SIGKILL)
+    time.sleep(60)
+
+
+@pytest.mark.slow
 def test_machines_without_the_package_or_with_another_one(monkeypatch):
     monkeypatch.setattr(cluster_module, "version", lambda _: "9.9")
     with pytest.raises(ImportError, match=r"has nht .*, this machine has 9\.9: install the same there"):
