@@ -46,7 +46,8 @@ class TrainingStatistics:
 
     def _clear(self) -> None:
         self._sums: dict[str, torch.Tensor | float] = defaultdict(float)
-        self._updates = self._episodes = self._steps = 0
+        self._updates = self._steps = 0
+        self._episodes: torch.Tensor | int = 0
 
     def add_losses(self, losses: TensorDictBase) -> None:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
@@ -55,19 +56,25 @@ class TrainingStatistics:
             self._sums[name] = self._sums[name] + losses[name].detach().double()
 
     def add_steps(self, steps: TensorDictBase) -> None:
-        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations."""
+        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations.
+
+        As of losses, the sums stay tensors.
+        """
         outcome = steps["next"]
         done, actuation = outcome["done"], outcome["actuation"]
         self._steps += len(steps)
-        self._sums[CLIPPED] += float(((actuation <= self._low) | (actuation >= self._high)).any(-1).sum())
-        self._episodes += int(done.sum())
+        self._add(CLIPPED, ((actuation <= self._low) | (actuation >= self._high)).any(-1))
+        self._episodes = self._episodes + done.sum()
         for name in (SUCCESS, FAILURE):
-            self._sums[name] += float((outcome[name] & done).sum())
-        self._sums[DIVERGED] += float(outcome[DIVERGED].sum())
+            self._add(name, outcome[name] & done)
+        self._add(DIVERGED, outcome[DIVERGED])
+
+    def _add(self, name: str, flags: torch.Tensor) -> None:
+        self._sums[name] = self._sums[name] + flags.sum().double()
 
     def state_dict(self) -> dict[str, Any]:
         """The sums so far."""
-        counts = {"updates": self._updates, "episodes": self._episodes, "steps": self._steps}
+        counts = {"updates": self._updates, "episodes": int(self._episodes), "steps": self._steps}
         return {
             "counts": counts,
             "sums": {name: torch.as_tensor(total) for name, total in self._sums.items()},
@@ -89,7 +96,7 @@ class TrainingStatistics:
             FloatingPointError: if a loss is no longer finite: the networks are lost.
         """
         names = (SUCCESS, FAILURE, DIVERGED, CLIPPED, *self._losses)
-        counts = (self._updates, self._episodes, self._steps)
+        counts = (self._updates, int(self._episodes), self._steps)
         own = torch.tensor([*counts, *(float(self._sums[name]) for name in names)], dtype=torch.float64)
         (updates, episodes, steps), values = (part.tolist() for part in add(own).split([3, len(names)]))
         sums = dict(zip(names, values, strict=True))

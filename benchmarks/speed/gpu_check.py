@@ -1,0 +1,113 @@
+"""Whether everything computes on a GPU what it computes on the CPU, and how fast: for a machine that has one.
+
+python benchmarks/speed/gpu_check.py                 # on a GPU, less than ten minutes
+python benchmarks/speed/gpu_check.py --device cpu    # the same steps where there is none
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas
+import torch
+
+from nht.recipes.agents.table import find_algorithm
+from nht.recipes.launch import configure
+
+ROOT = Path(__file__).resolve().parents[2]
+TASKS = {"wam_wipe": "nht", "half_cheetah": "svd"}
+ALGORITHMS = ("ddpg", "td3", "sac", "ppo")
+OFF_POLICY = ("algo.warmup_frames=0", "algo.updates_per_batch=20", "algo.random_frames=0")
+SHARED = (
+    "algo.total_frames=4000",
+    "evaluation.every=2000",
+    "evaluation.episodes=5",
+    "evaluation.video=false",
+    "run.checkpoint_every=4000",
+    "run.wandb=false",
+    "demos.transitions=2000",
+    "map.max_steps=200",
+    "env.options.max_episode_steps=200",
+)
+TOLERANCE = 0.05
+"""Relative: of the losses' means over the first updates. Sums in another order grow apart as training goes on."""
+
+
+def main() -> None:
+    """Run the GPU's tests, then train a little with every algorithm, on the device and on the CPU."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--tests", action=argparse.BooleanOptionalAction, default=True)
+    told = parser.parse_args()
+    print(f"torch {torch.__version__}, {name_of(told.device)}")
+    if told.tests:
+        run_tests()
+    with tempfile.TemporaryDirectory() as scratch:
+        rows = list(compared(Path(scratch), told.device))
+    table = pandas.DataFrame(rows)
+    print(table.to_string(index=False))
+    if wrong := table.loc[~table["agrees"], ["task", "algorithm"]].to_numpy().tolist():
+        sys.exit(f"the losses on {told.device} are not those on the CPU: {wrong}")
+
+
+def name_of(device: str) -> str:
+    """What computes."""
+    return torch.cuda.get_device_name() if device.startswith("cuda") else device
+
+
+def run_tests() -> None:
+    """The tests that need a GPU, which other machines pass over, and those of what must never wait for one."""
+    files = ["tests/envs/test_envs.py", "tests/transforms/test_transform_specs.py"]
+    files += ["tests/nht/test_maps_on_gpus.py", "tests/recipes/agents/test_updates_on_gpus.py"]
+    command = [sys.executable, "-m", "pytest", "-q", "--import-mode=importlib", "-k", "cuda or gpu", *files]
+    subprocess.run(command, cwd=ROOT, check=True)
+
+
+def compared(scratch: Path, device: str) -> Iterator[dict[str, object]]:
+    """A row for every task and algorithm: speeds on the device, and whether its first losses are the CPU's."""
+    for task, map in TASKS.items():
+        for algorithm in ALGORITHMS:
+            runs = [
+                trained(scratch / f"{task}-{algorithm}-{place}", task, map, algorithm, where)
+                for place, where in (("cpu", "cpu"), ("device", device))
+            ]
+            (on_cpu, cpu_seconds), (on_device, seconds) = runs
+            losses = [column for column in on_cpu if column.startswith("loss")]
+            first = [run[losses].iloc[0] for run in (on_cpu, on_device)]
+            difference = ((first[1] - first[0]).abs() / first[0].abs().clip(lower=1e-3)).max()
+            frames, updates = on_device[["frames", "updates"]].iloc[-1]
+            yield {
+                "task": task,
+                "algorithm": algorithm,
+                "frames/s": round(frames / seconds, 1),
+                "cpu frames/s": round(frames / cpu_seconds, 1),
+                "ms an update, all told": round(1e3 * seconds / updates, 2),
+                "difference": float(difference),
+                "agrees": bool(difference <= TOLERANCE),
+            }
+
+
+def trained(
+    folder: Path, task: str, map: str, algorithm: str, device: str
+) -> tuple[pandas.DataFrame, float]:
+    """The metrics of a short run, and its seconds without the first stretch, in which kernels are loaded."""
+    record = find_algorithm(algorithm)
+    own = () if algorithm == "ppo" else OFF_POLICY
+    demos = () if task == "wam_wipe" else ("map=none",)
+    overrides = [f"env={task}", f"map={map}", *demos, *SHARED, *own, f"device={device}", f"run.folder={folder}"]
+    if algorithm == "ppo":
+        overrides += ["algo.frames_per_batch=2000", "env.num_envs=10"]
+    started = time.perf_counter()
+    record.train(configure(record.schema, algorithm, overrides))
+    metrics = pandas.read_csv(folder / "metrics.csv")
+    return metrics, time.perf_counter() - started
+
+
+if __name__ == "__main__":
+    main()
