@@ -1,5 +1,7 @@
 """Films of test episodes: what is on them, and that the last moment is."""
 
+import sys
+
 import imageio.v3 as imageio
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 import nht
+import tiny_runs
 from nht.envs import make_env
 from nht.envs.rendering import coarse_shadows
 from nht.recipes.run.environments import mapped_env
@@ -175,3 +178,16 @@ def test_a_picture_may_be_larger_than_the_models_own_buffer():
     renderer = task.renderer(800, 600)
     assert renderer.frame(0).shape == (600, 800, 3)
     renderer.close()
+
+
+def test_without_the_package_that_draws_it_a_task_is_trained_and_not_filmed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    told = ["env=gymnasium", "env.name=Pendulum-v1", "map.action_scale=2", "evaluation.video=true"]
+    told = [*told, "algo.total_frames=200", "evaluation.every=200"]
+    metrics = tiny_runs.train("ppo", tmp_path / "run", *told)
+    assert metrics["frames"].tolist() == [200]
+    said = capsys.readouterr().out
+    assert "no video: the environment cannot be drawn: pygame is not installed" in said
+    assert "gymnasium[classic" in said
+    assert not (tmp_path / "run" / "video.mp4").exists()
+    assert (tmp_path / "run" / "whole.json").exists()
