@@ -61,7 +61,11 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
             outcome = evaluate(env, policy, on_step=watch)
     finally:
         film.close()
-    options = {"fps": film.frames_per_second, "macro_block_size": 8, "ffmpeg_params": ["-preset", PRESET]}
+    options: dict[str, Any] = {
+        "fps": film.frames_per_second,
+        "macro_block_size": 8,
+        "ffmpeg_params": ["-preset", PRESET],
+    }
     with imageio.get_writer(path, **options) as writer:
         video: Any = writer  # its stub lacks append_data
         for tiles in film.frames:
