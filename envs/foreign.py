@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase, SerialEnv
 
 from nht.envs.flat_env import flattened
 from nht.envs.foreign_copies import ForeignCopy, ForeignTask
+from nht.envs.mujoco_log import warnings_logged
 from nht.envs.pictures import Pictures, check_mode
 from nht.envs.simulation import DEFAULT_SIZE
 from nht.envs.torchrl_internals import members
@@ -49,6 +50,7 @@ class ForeignEnv(SerialEnv):
 
     task: ForeignTask
 
+    @warnings_logged()
     def __init__(
         self,
         make: Callable[[], EnvBase],
@@ -71,6 +73,7 @@ class ForeignEnv(SerialEnv):
         self._pictures = Pictures(self.task)
         self.set_seed(int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed)
 
+    @warnings_logged()
     def _reset(self, tensordict: TensorDictBase | None = None, **options: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         started = super()._reset(tensordict, **options)
@@ -81,6 +84,7 @@ class ForeignEnv(SerialEnv):
         self._shown = shown
         return started
 
+    @warnings_logged()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_step", None)
         stepped = super()._step(tensordict)

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from nht.envs.arrays import Array
+from nht.envs.mujoco_log import warnings_logged
 
 ASSETS = Path(__file__).parent / "assets"
-LOGGER = logging.getLogger(__name__)
 
 
 def load_model(path: Path) -> mujoco.MjModel:
@@ -27,19 +27,16 @@ def load_model(path: Path) -> mujoco.MjModel:
 def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjModel:
     """What ``build`` compiles.
 
-    MuJoCo's warnings, which it would also write to a file in the working folder, go to this module's logger.
+    MuJoCo's warnings go to the log, as mere information: the model is no work of whoever asks for it.
 
     Raises:
         ValueError: if it does not compile: the name, and MuJoCo's message.
     """
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(LOGGER.info)
     try:
-        return build()
+        with warnings_logged(logging.INFO, others=True):
+            return build()
     except ValueError as error:
         raise ValueError(f"{name} does not compile: {error}") from error
-    finally:
-        mujoco.set_mju_user_warning(previous)
 
 
 def check_state(model: mujoco.MjModel, qpos: Array, qvel: Array, copies: int, tolerance: float) -> None:

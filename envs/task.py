@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from nht.envs.arrays import Array, Flags, Rows, Seed
 from nht.envs.models import ASSETS, check_state, compile_model, load_model
+from nht.envs.mujoco_log import warnings_logged
 from nht.envs.outcome import OUTCOME_FLAGS, Outcome
 from nht.envs.physics import BatchedPhysics
 from nht.envs.simulation import DEFAULT_SIZE
@@ -128,6 +129,7 @@ class BatchedTask(BatchedPhysics, ABC):
 
     # What every task shares.
 
+    @warnings_logged()
     def reset(self, rows: Rows | None = None) -> None:
         """Start a new episode in the copies ``rows`` (all by default) and leave the others alone."""
         self._check_open()
@@ -147,6 +149,7 @@ class BatchedTask(BatchedPhysics, ABC):
             self.rng = self._generators[owner]
             self._draw_start(rows[owners == owner])
 
+    @warnings_logged()
     def step(self, actuation: NDArray[np.floating[Any]], rows: Rows | None = None) -> Outcome:
         """Advance the copies ``rows`` (all by default) by one environment step, and leave the others alone.
 

@@ -12,6 +12,9 @@ from typing import Any, ClassVar
 DEFAULT_SCALE = "default"
 """Of ``map.action_scale``: what the kind of map says."""
 
+MOST_THREADS = 1_024
+"""That a task may be stepped by: each has a simulation of its own, and a configuration may be a stranger's."""
+
 
 def path_field(default: str | None) -> Any:
     """A field that holds a path: on the command line it may hold any character, and ``~`` is the user's home."""
@@ -30,12 +33,14 @@ class EnvConfig:
     options: dict[str, Any] = field(default_factory=dict)  # of the task itself, in training and in evaluation
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a task without a name."""
+        """Raise ValueError for a task without a name, or more threads than any machine has."""
         if not self.name:
             raise ValueError(
                 f"env.name must name a task of {self.suite}, for torchrl what makes it: "
                 "env.name=my_package.robots:make."
             )
+        if not 1 <= self.num_threads <= MOST_THREADS:
+            raise ValueError(f"env.num_threads must be in 1 ... {MOST_THREADS}, got {self.num_threads}.")
 
 
 @dataclass

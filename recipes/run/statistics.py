@@ -51,7 +51,7 @@ class TrainingStatistics:
     def _clear(self) -> None:
         self._sums: dict[str, torch.Tensor | float] = defaultdict(float)
         self._updates = self._steps = 0
-        self._episodes: int | torch.Tensor = 0
+        self._episodes: torch.Tensor | int = 0
 
     def add_losses(self, losses: TensorDictBase) -> None:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
@@ -60,25 +60,30 @@ class TrainingStatistics:
             self._sums[name] = self._sums[name] + losses[name].detach().double()
 
     def add_steps(self, steps: TensorDictBase) -> None:
-        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations."""
+        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations.
+
+        As of losses, the sums stay tensors.
+        """
         outcome = steps["next"]
         done, actuation = outcome["done"], outcome["actuation"]
         self._steps += steps.shape[-1]
         clipped = ((actuation <= self._low) | (actuation >= self._high)).any(-1, keepdim=True)
         self._episodes = self._episodes + self._count(done)
-        self._sums[CLIPPED] += self._count(clipped)
+        self._add(CLIPPED, clipped)
         for name in (SUCCESS, FAILURE):
-            self._sums[name] += self._count(outcome[name] & done)
-        self._sums[DIVERGED] += self._count(outcome[DIVERGED])
+            self._add(name, outcome[name] & done)
+        self._add(DIVERGED, outcome[DIVERGED])
 
-    def _count(self, flags: torch.Tensor) -> Any:
+    def _add(self, name: str, flags: torch.Tensor) -> None:
+        self._sums[name] = self._sums[name] + self._count(flags)
+
+    def _count(self, flags: torch.Tensor) -> torch.Tensor:
         """How many of ``(T, 1)`` are true; of each learner's, where there are several."""
-        counted = flags.squeeze(-1).sum(-1)
-        return int(counted) if self._learners is None else counted.double().cpu()
+        return flags.squeeze(-1).sum(-1).double()
 
     def state_dict(self) -> dict[str, Any]:
         """The sums so far."""
-        counts = {"updates": self._updates, "episodes": self._episodes, "steps": self._steps}
+        counts = {"updates": self._updates, "episodes": int(self._episodes), "steps": self._steps}
         return {
             "counts": counts,
             "sums": {name: torch.as_tensor(total) for name, total in self._sums.items()},

@@ -14,11 +14,12 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 try:
     import ray
-    from ray.exceptions import RayError
+    from ray.exceptions import OutOfMemoryError, RayError, RayTaskError, WorkerCrashedError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 except ImportError as error:
     raise ImportError("searches need Ray: pip install 'nht[search]'.") from error
 
+from nht.reading import shortened
 from nht.recipes.study.jobs import Ending, Job
 from nht.recipes.study.packs import Pack
 
@@ -64,6 +65,9 @@ class Cluster:
 
         A task whose worker dies is tried again, three times; then its runs are recorded as failed. Those that are told
         ``device=cuda`` get a GPU.
+
+        Raises:
+            RuntimeError: if Ray itself fails, or a run can be neither begun nor recorded: that is no result of a run's.
         """
         remote = ray.remote(num_cpus=1, max_retries=3)(work)
         waiting = {remote.options(num_gpus=_gpus(task)).remote(task, folder): task for task in tasks}
@@ -72,11 +76,15 @@ class Cluster:
             task = waiting.pop(ready)
             try:
                 ray.get(ready)
-            except RayError as error:
-                reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            except (WorkerCrashedError, OutOfMemoryError) as error:
                 for job in task.jobs:
                     if Ending.read(folder / job.name) is None:  # it may have died after its work was done
-                        Ending("failed", reason).write(folder / job.name)
+                        Ending("failed", _reason(error)).write(folder / job.name)
+            except RayError as error:
+                raise RuntimeError(
+                    f"{folder}: {task.name} is not finished: {_reason(error)}. Start the same command again: "
+                    "what was finished is kept."
+                ) from error
             yield task
 
     def close(self) -> None:
@@ -86,6 +94,11 @@ class Cluster:
 
 def _gpus(task: Job | Pack) -> int:
     return int(any(word.startswith("device=cuda") for word in task.jobs[0].overrides))
+
+
+def _reason(error: RayError) -> str:
+    cause = error.cause if isinstance(error, RayTaskError) else error
+    return f"{type(cause).__name__}: {shortened(cause)}"
 
 
 def _check_answer(address: str) -> None:
