@@ -3,6 +3,7 @@
 import os
 import re
 import subprocess
+import sys
 import tomllib
 from importlib.metadata import requires
 from pathlib import Path
@@ -110,3 +111,29 @@ def test_setup_says_what_it_wants_where_there_is_no_python(tmp_path):
     assert done.returncode == 2
     assert "No Python 3.11 or newer with venv and ensurepip found among: python4.1." in done.stderr
     assert "make setup PYTHON=/path/to/python3.12" in done.stderr
+
+
+# What Python 3.14 does: it formats a help text as soon as an argument is added.
+EAGER = """
+import argparse, runpy, sys
+add = argparse._ActionsContainer.add_argument
+def add_and_format(self, *names, **options):
+    action = add(self, *names, **options)
+    if action.help and hasattr(self, "_get_formatter"):
+        self._get_formatter()._expand_help(action)
+    return action
+argparse._ActionsContainer.add_argument = add_and_format
+"""
+HYDRAS = "from hydra._internal.utils import get_args_parser; get_args_parser()"
+OURS = """
+sys.argv = ["ddpg", "--help"]
+runpy._run_module_as_main("nht.recipes.ddpg")
+"""
+
+
+def test_the_recipes_do_without_hydras_parser_which_python_3_14_refuses():
+    done = subprocess.run([sys.executable, "-c", EAGER + OURS], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "gamma" in done.stdout
+    refused = subprocess.run([sys.executable, "-c", EAGER + HYDRAS], capture_output=True, text=True)
+    assert "LazyCompletionHelp" in refused.stderr, "Hydra can be used there now: say so in the README"
