@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+MISSING = (
+    "tasks of dm_control need its package: pip install 'nht[dm_control]', and on Python 3.13 or newer, for which its "
+    "labmaze has no wheel, pip install --no-deps dm_control after that."
+)
+
 
 def make_dm_control(
     name: str, num_envs: int = 1, seed: int | None = None, device: torch.device | str = "cpu", **options: Any
@@ -53,7 +58,7 @@ def suite_module(domain: str) -> Any:
             warnings.filterwarnings("ignore", message=".*(DISPLAY|GLFW)", module="glfw")
             from dm_control import suite
     except ImportError as error:
-        raise ImportError("tasks of dm_control need its package: pip install 'nht[dm_control]'.") from error
+        raise ImportError(MISSING) from error
     return getattr(suite, domain)
 
 

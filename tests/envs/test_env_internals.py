@@ -3,13 +3,13 @@
 import gymnasium
 import pytest
 import torch
-from dm_control import suite
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import DMControlEnv, EnvBase, GymEnv, SerialEnv
 
 from nht.envs import gymnasium_internals as of_gymnasium
 from nht.envs import torchrl_internals as of_torchrl
+from nht.envs.dm_control import MISSING
 from nht.envs.dm_control_internals import SuiteClock
 
 
@@ -85,6 +85,7 @@ def test_gymnasiums_generator():
     ("domain", "task", "limit"), [("reacher", "easy", 1_000), ("lqr", "lqr_2_1", float("inf"))]
 )
 def test_the_suites_clock(domain, task, limit):
+    suite = pytest.importorskip("dm_control.suite", reason=MISSING)
     env = suite.load(domain, task, task_kwargs={"random": 0})
     clock = SuiteClock(env)
     assert clock.limit == limit

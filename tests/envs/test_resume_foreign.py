@@ -3,13 +3,13 @@
 import os
 import pickle
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from dm_control import suite
 
 from fresh_process import run
 from nht.envs import make_dm_control, make_gymnasium
@@ -47,6 +47,10 @@ def mujoco_tasks():
 
 
 def suite_tasks():
+    if find_spec("dm_control") is None:
+        return []
+    from dm_control import suite
+
     return sorted(
         f"{domain}-{task}" for domain, task in suite.ALL_TASKS if f"{domain}-{task}" not in QUICK_SUITE
     )

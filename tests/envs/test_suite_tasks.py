@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from dm_control import suite
 from scipy.stats import ks_2samp
 
 from nht.envs import make_task
+from nht.envs.dm_control import MISSING
 
+suite = pytest.importorskip("dm_control.suite", reason=MISSING)
 NAMES = {"cheetah_run": ("cheetah", "run"), "manipulator_bring_ball": ("manipulator", "bring_ball")}
 
 
