@@ -16,6 +16,7 @@ import nht
 from nht.reading import entry, read_json
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.learners import check_alike
+from nht.recipes.run.memory import check_memory
 from nht.recipes.run.metrics import FRAMES, TESTED
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import Training
@@ -79,6 +80,7 @@ class PopulationFolder:
 
     Raises:
         ValueError: if they cannot share every call, or two have one folder.
+        MemoryError: if their replay buffers do not fit; says how many would.
         FileExistsError, FileNotFoundError: as ``RunFolder``.
 
     Attributes:
@@ -92,6 +94,7 @@ class PopulationFolder:
         folders = [config.run.folder for config in configs]
         if len(set(folders)) < len(folders):
             raise ValueError(f"every learner needs a folder of its own, got {sorted(folders)}.")
+        check_memory(configs)
         self.path = path
         resume = configs[0].run.resume
         if resume is True and not any(Path(folder).exists() for folder in folders):
@@ -173,11 +176,15 @@ class PopulationFolder:
             reason = diverged(member.path)
             last = pandas.read_csv(member.metrics).iloc[-1] if member.metrics.exists() else {}
             rows.append(
-                {"learner": member.path.name, **{name: last.get(name) for name in (FRAMES, *TESTED)}}
+                {"learner": self._named(member), **{name: last.get(name) for name in (FRAMES, *TESTED)}}
                 | ({"diverged": reason} if reason is not None else {})
             )
         print(pandas.DataFrame(rows).to_string(index=False))
         print(f"\n{self.path}: {len(self.members)} learners, each in a folder of its own")
+
+    def _named(self, member: RunFolder) -> str:
+        inside = member.path.is_relative_to(self.path)
+        return str(member.path.relative_to(self.path) if inside else Path(*member.path.parts[-2:]))
 
     def close(self) -> None:
         """Let go of all folders."""
