@@ -53,9 +53,7 @@ def main(*configs: DDPG, together: str | None = None) -> None:
             (loss.value_network_params.values(True, True), algo.critic_learning_rate),
         ]
     )
-    buffer = replay_buffer(
-        min(ranks.share("algo.buffer_size", algo.buffer_size), algo.total_frames), ranks.device
-    )
+    buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
     batch_size = learners.each(ranks.share("algo.batch_size", algo.batch_size))
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     explorer = exploring(policy, envs.train, algo)
