@@ -101,6 +101,8 @@ class _LearnerByLearner(TorchFunctionMode):
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
         given = kwargs or {}
+        if given.get("generator") is not None:
+            return func(*args, **given)  # one learner's own
         if func in IN_PLACE:
             return self._fill(IN_PLACE[func], *args, **given)
         if func in LIKE:
