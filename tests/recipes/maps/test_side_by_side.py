@@ -18,8 +18,8 @@ def made(kind="nht", seed=0, **settings):
     """An untrained map of a kind with numbers of its own in whatever training would set."""
     torch.manual_seed(seed)
     map = make_map(MapConfig(kind, hidden=[8, 8], **settings), CONTEXT, MOTORS, seed, EnvConfig())
-    for name, parameter in map.named_parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter) if "raw" not in name else 0.0
+    for parameter in map.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
     if isinstance(map, nht.SVD):
         map.frame.copy_(torch.linalg.qr(torch.randn(MOTORS, map.action_dim)).Q)
     map.set_action_scale(1.0 + seed)
