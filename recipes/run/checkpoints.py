@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
@@ -30,10 +31,11 @@ class Checkpoints:
         folder: where they are.
         parts: what a run goes on from, each with a ``state_dict`` and a ``load_state_dict``, or a replay buffer; the
             generators of torch, NumPy and Python are added.
+        learners: whose networks are stacked, if several: one that is lost does not keep the others from going on.
     """
 
-    def __init__(self, folder: Path, **parts: Any) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, *, learners: int | None = None, **parts: Any) -> None:
+        self._folder, self._learners = folder, learners
         self._parts = {
             name: BufferState(part) if isinstance(part, ReplayBuffer) else part
             for name, part in {**parts, "random": GlobalRNGState()}.items()
@@ -98,7 +100,7 @@ class Checkpoints:
             raise ValueError(f"{path} lacks the parts {missing}, it has {shown(sorted(states))}.")
         for name, part in self._parts.items():
             if isinstance(part, nn.Module):
-                check_finite(states[name], part.state_dict(), f"{path}, {name!r}")
+                check_finite(states[name], part.state_dict(), f"{path}, {name!r}", self._learners)
         for name, part in sorted(self._parts.items()):
             try:
                 part.load_state_dict(states[name])
@@ -113,12 +115,19 @@ class Checkpoints:
                 raise ValueError(f"{path}, {name!r} does not fit this run: {shortened(error)}.") from error
 
 
-def check_finite(saved: Any, own: dict[str, Any], where: str) -> None:
+def check_finite(saved: Any, own: dict[str, Any], where: str, learners: int | None = None) -> None:
     """Check that the numbers of a network are finite, those aside that are the same in the network as it is built.
+
+    Args:
+        saved: the network's state.
+        own: that of the network as it is built.
+        where: they come from, for the message.
+        learners: whose networks are stacked in it, if several: then some of them may be lost, but not all.
 
     Raises:
         ValueError: if there are others.
     """
+    lost = torch.zeros(learners or 1, dtype=torch.bool)
     for name, value in saved.items() if isinstance(saved, dict) else ():
         if not isinstance(value, Tensor) or not value.is_floating_point():
             continue
@@ -126,7 +135,9 @@ def check_finite(saved: Any, own: dict[str, Any], where: str) -> None:
         known = own.get(name)
         if isinstance(known, Tensor) and known.shape == value.shape:
             wrong &= value.to(known.device) != known
-        if wrong.any():
+        stacked = learners is not None and value.shape[:1] == (learners,)
+        lost |= wrong.reshape(len(lost), -1).any(1).cpu() if stacked else wrong.any().cpu()
+        if lost.all():
             raise ValueError(
                 f"{where}: {name} holds {int(wrong.sum())} NaN or infinite values: training had diverged."
             )

@@ -101,6 +101,7 @@ class Loop:
             )
         self._checkpoints = Checkpoints(
             folder.path / "checkpoints" / ranks.folder,
+            learners=None if learners is None else learners.count,
             loss=loss,
             **parts,
             collector=CollectorState(self.collector, envs.seed, exact=simulation.can_resume),
