@@ -54,9 +54,7 @@ def main(*configs: DDPG, together: str | None = None) -> None:
         ]
     )
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
-    batch_size = learners.each(algo.batch_size)
-    if learners.count is None:
-        batch_size = ranks.share("algo.batch_size", batch_size)
+    batch_size = learners.each(ranks.share("algo.batch_size", algo.batch_size))
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     explorer = exploring(policy, envs.train, algo)
     loop = Loop(

@@ -173,12 +173,17 @@ def descend(losses: Sequence[Tensor], optimiser: torch.optim.Optimizer, ranks: R
 class Exploration(Protocol):
     """Settings of the noise that an algorithm explores with."""
 
-    exploration_noise: Setting
-    """Standard deviation; actions lie in [-1, 1]."""
-    noise_memory: Setting
-    """Steps after which the noise has forgotten itself; 1 is white noise."""
-    random_action: Setting
-    """Probability of a uniform action instead."""
+    @property
+    def exploration_noise(self) -> Setting:
+        """Standard deviation; actions lie in [-1, 1]."""
+
+    @property
+    def noise_memory(self) -> Setting:
+        """Steps after which the noise has forgotten itself; 1 is white noise."""
+
+    @property
+    def random_action(self) -> Setting:
+        """Probability of a uniform action instead."""
 
 
 def exploring(policy: TensorDictModule, env: EnvBase, algo: Exploration) -> TensorDictSequential:

@@ -190,7 +190,7 @@ class PopulationFolder:
         rows = []
         for member in self.members:
             reason = diverged(member.path)
-            last = pandas.read_csv(member.metrics).iloc[-1] if member.metrics.exists() else {}
+            last: Any = pandas.read_csv(member.metrics).iloc[-1] if member.metrics.exists() else {}
             rows.append(
                 {"learner": self._named(member), **{name: last.get(name) for name in (FRAMES, *TESTED)}}
                 | ({"diverged": reason} if reason is not None else {})
