@@ -37,7 +37,7 @@ class Checkpoints:
     def __init__(self, folder: Path, *, learners: int | None = None, **parts: Any) -> None:
         self._folder, self._learners = folder, learners
         self._parts = {
-            name: BufferState(part) if isinstance(part, ReplayBuffer) else part
+            name: BufferState(part, learners) if isinstance(part, ReplayBuffer) else part
             for name, part in {**parts, "random": GlobalRNGState()}.items()
         }
 
@@ -155,10 +155,16 @@ def _is_whole(path: Path) -> bool:
 
 
 class BufferState:
-    """What a replay buffer holds, as a state dictionary: its rows as far as it is filled, and where it writes next."""
+    """What a replay buffer holds, as a state dictionary: its rows as far as it is filled, and where it writes next.
 
-    def __init__(self, buffer: ReplayBuffer) -> None:
+    Args:
+        buffer: of rows ``()``.
+        learners: a step of each of whom a row is, ``(learners,)``, if there are several.
+    """
+
+    def __init__(self, buffer: ReplayBuffer, learners: int | None = None) -> None:
         self._buffer = buffer
+        self._row = [] if learners is None else [learners]
 
     def state_dict(self) -> dict[str, Any]:
         """Rows ``(len(buffer),)`` by key, not copied; the state of writer and sampler."""
@@ -182,7 +188,9 @@ class BufferState:
             length = _length(rows)
             if length > storage.max_size:
                 raise ValueError(f"it holds {length} rows, the buffer has room for {storage.max_size}.")
-            storage.set(range(length), TensorDict(rows, batch_size=[length], device=storage.device))
+            storage.set(
+                range(length), TensorDict(rows, batch_size=[length, *self._row], device=storage.device)
+            )
         self._buffer.writer.load_state_dict(saved["writer"])
         if saved.get("sampler"):
             self._buffer.sampler.load_state_dict(saved["sampler"])

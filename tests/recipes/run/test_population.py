@@ -165,6 +165,7 @@ def test_a_map_that_gives_no_numbers_harms_no_other(algorithm, tmp_path):
     lost = populations.Lost(10, 7, 2)
     lost.context_keys = ("tool_position", "joint_angle")
     file = populations.nht.save_map(lost, tmp_path / "lost.safetensors")
+    other = populations.map_of(tmp_path / "maps", 1, hidden=(6,))  # applied by itself, like the lost one
     told = ["map.kind=populations:Lost", f"map.file={file}", "map.allow=[populations]"]
 
     def learners(*middle):
