@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from nht.envs.gymnasium_mujoco import make_gymnasium
     from nht.envs.gymnasium_vector import GymnasiumVectorEnv
     from nht.envs.mujoco_batch import BatchedMujocoEnv
+    from nht.envs.outcome import Outcome
     from nht.envs.simulation import Simulation
-    from nht.envs.task import BatchedTask, Outcome
+    from nht.envs.task import BatchedTask
     from nht.envs.torchrl_env import make_torchrl
 
 __all__ = [
@@ -50,7 +51,7 @@ _MODULES = {
     "ForeignEnv": "foreign",
     "GymnasiumEnv": "gymnasium_env",
     "GymnasiumVectorEnv": "gymnasium_vector",
-    "Outcome": "task",
+    "Outcome": "outcome",
     "Simulation": "simulation",
     "make_dm_control": "dm_control",
     "make_gymnasium": "gymnasium_mujoco",

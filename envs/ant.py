@@ -8,8 +8,8 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
+from nht.envs.arrays import Array, Flags, Rows, Seed
 from nht.envs.locomotion import Locomotion, Range, gymnasium_model
-from nht.envs.task import Array, Flags, Rows
 
 # Of a contact sensor: force, torque and position (bits 1, 2 and 4), of all contacts together.
 CONTACT_FIELDS, NET_FORCE = 1 << 1 | 1 << 2 | 1 << 4, 3
@@ -49,7 +49,7 @@ class Ant(Locomotion):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         forward_reward_weight: float = 1.0,
         ctrl_cost_weight: float | None = None,

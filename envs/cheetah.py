@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array, Flags, Seed
 from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
-from nht.envs.task import Array, Flags
 
 RUN_SPEED = 10.0
 """Speed of the centre of mass that is worth the full reward [m/s]."""
@@ -37,7 +37,7 @@ class CheetahRun(SuiteTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         max_episode_steps: int = 1_000,
     ) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from nht.envs.task import Array
+from nht.envs.arrays import Array
 from nht.envs.wam_grasp import GRASP_RADIUS, OBJECT_CENTRE
 from nht.envs.wam_kinematics import damped_solve, forward_kinematics
 from nht.envs.wam_wipe import DOWN, TABLE_HEIGHT

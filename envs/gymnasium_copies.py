@@ -15,7 +15,7 @@ from torchrl.data import Binary, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from nht.envs.foreign import ForeignCopy
+from nht.envs.foreign_copies import ForeignCopy
 from nht.envs.gymnasium_internals import EpisodeClock
 from nht.envs.mujoco_copy import Simulator
 from nht.envs.python_state import PythonState

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torchrl.envs import EnvBase, GymEnv
 
-from nht.envs.foreign import FLAGS, ForeignEnv
+from nht.envs.flat_env import FLAGS
+from nht.envs.foreign import ForeignEnv
 from nht.envs.gymnasium_copies import GymnasiumCopy, InfoReader, NativeCopy, gymnasium_copy
 
 

@@ -11,11 +11,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array, Flags
 from nht.envs.gymnasium_env import FLAGS, check_render_mode, metadata_of, spaces_of
 from nht.envs.pictures import Pictures
 from nht.envs.registry import make_task
 from nht.envs.simulation import DEFAULT_SIZE
-from nht.envs.task import Array, Flags
 
 Observations = NDArray[np.float32]
 

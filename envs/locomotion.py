@@ -15,7 +15,9 @@ from typing import ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import Array, BatchedTask, Flags, load_model
+from nht.envs.arrays import Array, Flags, Seed
+from nht.envs.models import load_model
+from nht.envs.task import BatchedTask
 
 Range = tuple[float, float]
 T = TypeVar("T")
@@ -61,7 +63,7 @@ class Locomotion(BatchedTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         forward_reward_weight: float = 1.0,
         ctrl_cost_weight: float | None = None,
@@ -177,7 +179,7 @@ class Walker2d(Locomotion):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         forward_reward_weight: float = 1.0,
         ctrl_cost_weight: float | None = None,

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array, Flags, Seed
 from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
-from nht.envs.task import Array, Flags
 
 ARM = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist")
 FINGERS = ("finger", "fingertip", "thumb", "thumbtip")
@@ -48,7 +48,7 @@ class BringBall(SuiteTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         max_episode_steps: int = 1_000,
     ) -> None:

@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
+from nht.envs.arrays import Rows
 from nht.envs.pictures import Pictures, check_mode
 from nht.envs.simulation import DEFAULT_SIZE
-from nht.envs.task import BatchedTask, Rows
+from nht.envs.task import BatchedTask
 from nht.envs.torchrl_internals import WholeSteps, packed
 
 
 class BatchedMujocoEnv(WholeSteps):
     """A TorchRL environment of batch size ``[N]`` whose N copies one native call steps together.
+
+    Told to be in groups, its batch size is ``[groups, N / groups]``; below, N stands for both.
 
     Reads ``"action"`` ``(N, n)``, the actuation; writes the task's observations (float32), ``"reward"`` and the
     flags ``"done"``, ``"terminated"``, ``"truncated"``, ``"success"``, ``"failure"`` and ``"diverged"``, each
@@ -32,10 +35,14 @@ class BatchedMujocoEnv(WholeSteps):
     Args:
         task: the copies to step.
         device: where the tensors go; the physics stays on the CPU.
+        groups: of equal numbers of copies, as those of several learners; None has no dimension for it.
     """
 
-    def __init__(self, task: BatchedTask, device: torch.device | str = "cpu") -> None:
-        super().__init__(device=device, batch_size=[task.num_envs])
+    def __init__(
+        self, task: BatchedTask, device: torch.device | str = "cpu", *, groups: int | None = None
+    ) -> None:
+        copies = [task.num_envs] if groups is None else [groups, task.num_envs // groups]
+        super().__init__(device=device, batch_size=copies)
         self.task = task
         self._make_specs()
         self._pictures = Pictures(task)
@@ -69,7 +76,8 @@ class BatchedMujocoEnv(WholeSteps):
         actuation = tensordict.get("action").detach()
         mask = tensordict.get("_step", None)
         rows = None if mask is None or mask.all() else _rows(mask)
-        outcome = self.task.step(actuation.to("cpu", torch.float64).numpy(), rows)
+        flat = actuation.reshape(-1, actuation.shape[-1])
+        outcome = self.task.step(flat.to("cpu", torch.float64).numpy(), rows)
         flags = {
             "done": outcome.terminated | outcome.truncated,
             "terminated": outcome.terminated,
@@ -86,7 +94,7 @@ class BatchedMujocoEnv(WholeSteps):
         return {key: self._tensor(values.astype(np.float32)) for key, values in self.task.observe().items()}
 
     def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
-        return torch.from_numpy(values).to(self.device)
+        return torch.from_numpy(values).to(self.device).view(*self.batch_size, -1)
 
     def _pack(self, entries: dict[str, torch.Tensor]) -> TensorDict:
         # Shapes and devices are ours: checking them again would cost more than the packing.
@@ -94,7 +102,9 @@ class BatchedMujocoEnv(WholeSteps):
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self.task.seed(seed)
+            groups = self.batch_size[0]
+            of_groups = np.random.SeedSequence(seed).generate_state(groups).tolist()
+            self.task.seed(seed if len(self.batch_size) == 1 else of_groups)
 
     def render(
         self,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nht.envs.arm import Arm
+from nht.envs.arrays import Seed
 from nht.envs.table import Table, imported
 
 if TYPE_CHECKING:
@@ -177,7 +178,7 @@ def make_env(
     name: str,
     num_envs: int = 1,
     num_threads: int = 1,
-    seed: int | None = None,
+    seed: Seed = None,
     device: torch.device | str = "cpu",
     **options: Any,
 ) -> BatchedMujocoEnv:
@@ -187,7 +188,8 @@ def make_env(
         name: a key of ``TASKS``, e.g. ``"wam_wipe"``, or an import path, ``"my_package.tasks:Pour"``.
         num_envs: number of copies N, the environment's batch size.
         num_threads: native threads that share the copies.
-        seed: seed of every random draw of the task; None draws one, so that no two environments are alike.
+        seed: seed of every random draw of the task; None draws one, so that no two environments are alike. With several
+            seeds there are ``num_envs`` copies for each, whose draws are their own: the batch size is ``[seeds, N]``.
         device: where the tensors go.
         options: further arguments of the task, e.g. ``start="random"``.
 
@@ -196,8 +198,10 @@ def make_env(
     """
     from nht.envs.mujoco_batch import BatchedMujocoEnv
 
-    task = make_task(name, num_envs=num_envs, num_threads=num_threads, seed=seed, **options)
-    return BatchedMujocoEnv(task, device=device)
+    groups = len(seed) if isinstance(seed, Sequence) else None
+    copies = num_envs * (groups or 1)
+    task = make_task(name, num_envs=copies, num_threads=num_threads, seed=seed, **options)
+    return BatchedMujocoEnv(task, device=device, groups=groups)
 
 
 def make_expert(name: str, **settings: Any) -> Expert:

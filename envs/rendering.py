@@ -8,7 +8,9 @@ import os
 import socket
 import sys
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from itertools import pairwise
 from typing import Any, Protocol
 
@@ -23,6 +25,21 @@ from nht.envs.simulation import DEFAULT_SIZE
 Array = NDArray[np.float64]
 
 LINE = np.array([0.15, 0.35, 0.85, 0.9], dtype=np.float32)  # red, green, blue, opacity
+
+_most_shadow: ContextVar[int | None] = ContextVar("_most_shadow", default=None)
+
+
+@contextmanager
+def coarse_shadows(width: int) -> Iterator[None]:
+    """Renderers that are opened within draw shadows no finer than ``width`` pixels: in software half of all the work.
+
+    Models ask for shadow maps of up to 4,096 pixels a side; in small pictures a quarter of that looks the same.
+    """
+    before = _most_shadow.set(width)
+    try:
+        yield
+    finally:
+        _most_shadow.reset(before)
 
 
 class Scene(Protocol):
@@ -218,7 +235,8 @@ def _draw_line(scene: mujoco.MjvScene, points: Array, width: float = 3.0) -> Non
 def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     _prefer_offscreen_platform()
     try:
-        renderer = mujoco.Renderer(model, height, width)
+        with _visual_settings(model, width, height):
+            renderer = mujoco.Renderer(model, height, width)
     except Exception as error:
         raise RuntimeError(
             "offscreen rendering needs OpenGL: install EGL (Debian: libegl1 libgl1-mesa-dri), or OSMesa "
@@ -227,6 +245,19 @@ def _open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Ren
     # At exit MuJoCo ends EGL; what the collector frees after that prints a traceback.
     atexit.register(_close, weakref.ref(renderer))
     return renderer
+
+
+@contextmanager
+def _visual_settings(model: mujoco.MjModel, width: int, height: int) -> Iterator[None]:
+    """Within, the model asks for a buffer of just the picture's size, and for no finer shadows than are wanted."""
+    screen, quality, most = model.vis.global_, model.vis.quality, _most_shadow.get()
+    before = screen.offwidth, screen.offheight, quality.shadowsize
+    screen.offwidth, screen.offheight = width, height
+    quality.shadowsize = before[2] if most is None else min(before[2], most)
+    try:
+        yield
+    finally:
+        screen.offwidth, screen.offheight, quality.shadowsize = before
 
 
 def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:

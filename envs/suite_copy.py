@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torchrl.envs import EnvBase
 
 from nht.envs.dm_control_internals import SuiteClock
-from nht.envs.foreign import ForeignCopy
+from nht.envs.foreign_copies import ForeignCopy
 from nht.envs.mujoco_copy import Simulator
 from nht.envs.torchrl_internals import wrapped
 

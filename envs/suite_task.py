@@ -8,7 +8,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from nht.envs.task import Array, BatchedTask, compile_model
+from nht.envs.arrays import Array, Seed
+from nht.envs.models import compile_model
+from nht.envs.task import BatchedTask
 
 
 class SuiteTask(BatchedTask):
@@ -43,7 +45,7 @@ class SuiteTask(BatchedTask):
         control_timestep: float,
         num_envs: int,
         num_threads: int,
-        seed: int | None,
+        seed: Seed,
         max_episode_steps: int,
     ) -> None:
         text = xml if isinstance(xml, str) else xml.decode()

@@ -6,53 +6,40 @@ A task is the physics-facing half of an environment. It knows neither TorchRL no
 
 from __future__ import annotations
 
-import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import mujoco
 import numpy as np
-from mujoco import rollout
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array, Flags, Rows, Seed
+from nht.envs.models import ASSETS, check_state, compile_model, load_model
+from nht.envs.mujoco_log import warnings_logged
+from nht.envs.outcome import OUTCOME_FLAGS, Outcome
+from nht.envs.physics import BatchedPhysics
 from nht.envs.simulation import DEFAULT_SIZE
 
 if TYPE_CHECKING:
     from nht.envs.rendering import SceneRenderer
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Rows = NDArray[np.intp]
-"""Indices of copies."""
-
-ASSETS = Path(__file__).parent / "assets"
-LOGGER = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one environment step brought, a row per copy; every array is the caller's own.
-
-    ``truncated`` is the time limit, ``terminated`` an end that belongs to the task; they are never merged.
-    ``diverged`` marks copies whose actuation or physics was not finite: they failed and wait for a reset.
-    """
-
-    reward: Array
-    terminated: Flags
-    truncated: Flags
-    success: Flags
-    failure: Flags
-    diverged: Flags
+# What a task of one's own is written with, beside BatchedTask.
+__all__ = [
+    "ASSETS",
+    "Array",
+    "BatchedTask",
+    "Flags",
+    "Outcome",
+    "Rows",
+    "Seed",
+    "compile_model",
+    "load_model",
+]
 
 
-OUTCOME_FLAGS = ("terminated", "truncated", "success", "failure", "diverged")
-
-
-class BatchedTask(ABC):
+class BatchedTask(BatchedPhysics, ABC):
     """N copies of a task, each a row of one state array, stepped together by ``mujoco.rollout``.
 
     A subclass says how an actuation enters the simulation, where episodes start, what is observed and what counts
@@ -77,8 +64,6 @@ class BatchedTask(ABC):
     resume_obstacle: ClassVar[str] = ""
     reward_range: ClassVar[tuple[float, float]] = (-math.inf, math.inf)
     """Smallest and largest reward of a step."""
-    reads_sensors: ClassVar[bool] = False
-    """Whether ``sensors`` is kept, the values of the model's sensors in the state before the last substep."""
 
     def __init__(
         self,
@@ -88,57 +73,32 @@ class BatchedTask(ABC):
         substeps: int,
         max_episode_steps: int,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
     ) -> None:
         counts = {"num_envs": num_envs, "substeps": substeps, "num_threads": num_threads}
         for name, count in (counts | {"max_episode_steps": max_episode_steps}).items():
             if count < 1:
                 raise ValueError(f"{name} must be at least 1, got {count}.")
-        self.model = model
-        self.num_envs = num_envs
-        self.substeps = substeps
+        super().__init__(model, num_envs, substeps, num_threads)
         self.max_episode_steps = max_episode_steps
-        self.num_threads = num_threads
-        self.time_per_step: float = substeps * model.opt.timestep
-        """Simulated time of one environment step [s]."""
         self.seed(seed)
-
-        full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        self.state: Array = np.zeros((num_envs, mujoco.mj_stateSize(model, full_physics)))
         self.steps: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
         self._flags: Flags = np.zeros((num_envs, len(OUTCOME_FLAGS)), dtype=bool)  # of each copy's last step
-        self._control: Array = np.zeros((num_envs, substeps, model.nu))
-        self._trajectory: Array = np.zeros((num_envs, substeps, self.state.shape[1]))
-        self.sensors: Array = np.zeros((num_envs, model.nsensordata if self.reads_sensors else 0))
-        self._sensor_trajectory = np.zeros((num_envs, substeps, self.sensors.shape[1]))
-        self._open()
 
-    def _open(self) -> None:
-        """Make what belongs to this object alone: views into its arrays, and native memory and threads."""
-        model = self.model
-        # mjSTATE_FULLPHYSICS is laid out as time, qpos, qvel, act, ...
-        self.qpos: Array = self.state[:, 1 : 1 + model.nq]
-        self.qvel: Array = self.state[:, 1 + model.nq : 1 + model.nq + model.nv]
-        self._models = [model] * self.num_envs
-        self._data = [mujoco.MjData(model) for _ in range(self.num_threads)]
-        threads = self.num_threads if self.num_threads > 1 else 0
-        self._rollout: rollout.Rollout | None = rollout.Rollout(nthread=threads)
+    def seed(self, seed: Seed) -> None:
+        """Start the generator of all random draws anew; None takes a seed from the operating system.
 
-    def __getstate__(self) -> dict[str, Any]:
-        own = ("qpos", "qvel", "_models", "_data", "_rollout")
-        state = {name: value for name, value in self.__dict__.items() if name not in own}
-        return state | {"closed": self.closed}
+        Several seeds start a generator each, for equal numbers of copies in their order: what some draw does not depend
+        on the others.
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        closed = state.pop("closed")
-        self.__dict__.update(state)
-        self._open()
-        if closed:
-            self.close()
-
-    def seed(self, seed: int | None) -> None:
-        """Start the generator of all random draws anew; None takes a seed from the operating system."""
-        self.rng = np.random.default_rng(seed)
+        Raises:
+            ValueError: if the copies cannot be shared alike.
+        """
+        seeds = seed if isinstance(seed, Sequence) else [seed]
+        if not seeds or self.num_envs % len(seeds):
+            raise ValueError(f"{len(seeds)} seeds cannot share num_envs={self.num_envs} copies alike.")
+        self._generators = [np.random.default_rng(each) for each in seeds]
+        self.rng = self._generators[0]
 
     # What a task adds.
 
@@ -167,12 +127,9 @@ class BatchedTask(ABC):
     def _note_diverged(self, diverged: Flags) -> None:
         """Take note of the copies ``(N,)`` that diverged, before they are judged; by default nothing."""
 
-    def _apply(self, actuation: Array) -> None:
-        """Hand the actuation ``(N, n)`` to the simulation: by default as the control of all substeps."""
-        self._control[:] = actuation[:, None, :]
-
     # What every task shares.
 
+    @warnings_logged()
     def reset(self, rows: Rows | None = None) -> None:
         """Start a new episode in the copies ``rows`` (all by default) and leave the others alone."""
         self._check_open()
@@ -184,8 +141,15 @@ class BatchedTask(ABC):
         self.state[rows, 0] = self.model.opt.timestep
         self.steps[rows] = 0
         self._flags[rows] = False
-        self._draw_start(rows)
+        if len(self._generators) == 1:
+            self._draw_start(rows)
+            return
+        owners = rows // (self.num_envs // len(self._generators))
+        for owner in np.unique(owners):
+            self.rng = self._generators[owner]
+            self._draw_start(rows[owners == owner])
 
+    @warnings_logged()
     def step(self, actuation: NDArray[np.floating[Any]], rows: Rows | None = None) -> Outcome:
         """Advance the copies ``rows`` (all by default) by one environment step, and leave the others alone.
 
@@ -254,55 +218,6 @@ class BatchedTask(ABC):
             self._flags[:, column] = values
         return Outcome(reward, *flags)
 
-    def _advance(self, applied: Array, rows: Rows | None = None) -> Flags:
-        """Simulate all substeps of the copies ``rows``, all by default.
-
-        Returns:
-            ``(N,)`` which copies diverged: they keep their last good state.
-        """
-        self._apply(applied)
-        assert self._rollout is not None
-        some = slice(None) if rows is None else rows
-        before, control = self.state[some], self._control[some]
-        count = len(before)
-        trajectory, sensed = self._trajectory[:count], self._sensor_trajectory[:count]
-        self._rollout.rollout(
-            self._models[:count],
-            self._data,
-            before,
-            control,
-            control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
-            skip_checks=True,
-            nstep=control.shape[1],
-            state=trajectory,
-            sensordata=sensed if self.reads_sensors else None,
-        )
-        after = self._complete(trajectory, control, some)
-        # MuJoCo answers bad numbers by a reset of the simulation and then stands still: its clock falls behind.
-        elapsed = after[:, 0] - before[:, 0]
-        expected = (1 - 0.5 / self.substeps) * self.time_per_step
-        diverged = ~(np.isfinite(after).all(axis=1) & (elapsed > expected))
-        if diverged.any():
-            after = np.where(diverged[:, None], before, after)
-        self.state[some] = after
-        if self.reads_sensors:
-            self.sensors[some] = np.where(diverged[:, None], self.sensors[some], sensed[:, -1])
-        if rows is None:
-            return diverged
-        everywhere = np.zeros(self.num_envs, dtype=bool)
-        everywhere[rows] = diverged
-        return everywhere
-
-    def _complete(self, trajectory: Array, control: Array, rows: Rows | slice) -> Array:
-        """The state ``(M, ..)`` after the step: the last one of ``rollout``, unless a task takes substeps itself.
-
-        Args:
-            trajectory: the states ``(M, substeps, ..)`` that ``rollout`` went through.
-            control: the controls ``(M, substeps, nu)``.
-            rows: which copies the M are.
-        """
-        return trajectory[:, -1]
-
     def set_state(
         self, qpos: Array, qvel: Array, rows: Rows | None = None, *, tolerance: float = 0.1
     ) -> None:
@@ -321,14 +236,7 @@ class BatchedTask(ABC):
         """
         self._check_open()
         rows = np.arange(self.num_envs) if rows is None else rows
-        for name, given, size in (("qpos", qpos, self.model.nq), ("qvel", qvel, self.model.nv)):
-            if given.shape != (len(rows), size):
-                raise ValueError(f"expected {name} of shape {(len(rows), size)}, got {given.shape}.")
-            if not np.isfinite(given).all():
-                raise ValueError(
-                    f"{name} must be finite: row {np.argwhere(~np.isfinite(given))[0, 0]} is not."
-                )
-        _check_limits(self.model, qpos, tolerance)
+        check_state(self.model, qpos, qvel, len(rows), tolerance)
         saved = self.state_dict()
         saved["state"][rows, 1:] = 0.0
         saved["state"][rows, 1 : 1 + self.model.nq + self.model.nv] = np.concatenate([qpos, qvel], axis=1)
@@ -337,14 +245,20 @@ class BatchedTask(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Everything a later ``load_state_dict`` needs to go on bit for bit: physics, episode and generator."""
         arrays = {name: getattr(self, name).copy() for name in ("state", "steps", *self._episode_arrays)}
-        return {**arrays, "flags": self._flags.copy(), "rng": self.rng.bit_generator.state}
+        states = [generator.bit_generator.state for generator in self._generators]
+        random = self.rng.bit_generator.state if len(states) == 1 else states
+        return {**arrays, "flags": self._flags.copy(), "rng": random}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Go on from what ``state_dict`` returned."""
         for name in ("state", "steps", *self._episode_arrays):
             getattr(self, name)[:] = saved[name]
         self._flags[:] = saved.get("flags", False)  # older files lack them
-        self.rng.bit_generator.state = saved["rng"]
+        if len(self._generators) == 1:
+            self.rng.bit_generator.state = saved["rng"]
+            return
+        for generator, state in zip(self._generators, saved["rng"], strict=True):
+            generator.bit_generator.state = state
 
     _episode_arrays: ClassVar[tuple[str, ...]] = ()
     """Names of the subclass's own per-copy arrays, each with N rows: saved, and kept where a copy stands still."""
@@ -364,58 +278,3 @@ class BatchedTask(ABC):
         from nht.envs.rendering import SceneRenderer
 
         return SceneRenderer(self, width, height, 0 if camera is None else camera)
-
-    @property
-    def closed(self) -> bool:
-        """Whether ``close`` was called."""
-        return self._rollout is None
-
-    def close(self) -> None:
-        """Release the native threads. A second call does nothing."""
-        if self._rollout is not None:
-            self._rollout.close()
-            self._rollout = None
-
-    def _check_open(self) -> None:
-        if self.closed:
-            raise RuntimeError("the environment is closed: make a new one.")
-
-
-def load_model(path: Path) -> mujoco.MjModel:
-    """Compile an MJCF file.
-
-    Raises:
-        ValueError: if it does not compile: the file's name, and MuJoCo's message.
-    """
-    return compile_model(str(path), lambda: mujoco.MjModel.from_xml_path(str(path)))
-
-
-def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjModel:
-    """What ``build`` compiles.
-
-    MuJoCo's warnings, which it would also write to a file in the working folder, go to this module's logger.
-
-    Raises:
-        ValueError: if it does not compile: the name, and MuJoCo's message.
-    """
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(LOGGER.info)
-    try:
-        return build()
-    except ValueError as error:
-        raise ValueError(f"{name} does not compile: {error}") from error
-    finally:
-        mujoco.set_mju_user_warning(previous)
-
-
-def _check_limits(model: mujoco.MjModel, qpos: Array, tolerance: float) -> None:
-    limited = np.flatnonzero(model.jnt_limited)
-    angle = qpos[:, model.jnt_qposadr[limited]]
-    low, high = model.jnt_range[limited].T
-    beyond = np.maximum(low - angle, angle - high)
-    if beyond.size and beyond.max() > tolerance:
-        row, joint = np.unravel_index(beyond.argmax(), beyond.shape)
-        raise ValueError(
-            f"joint {model.joint(limited[joint]).name!r} stands at {angle[row, joint]:.4g} in row {row}, more than "
-            f"{tolerance} beyond its limits [{low[joint]:.4g}, {high[joint]:.4g}]."
-        )

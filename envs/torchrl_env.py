@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torchrl.envs import DMControlWrapper, EnvBase, GymWrapper
 
-from nht.envs.foreign import LONGEST_EPISODE, ForeignCopy, ForeignEnv
+from nht.envs.foreign import ForeignEnv
+from nht.envs.foreign_copies import LONGEST_EPISODE, ForeignCopy
 from nht.envs.gymnasium_copies import FRAME_RATE, gymnasium_copy
 from nht.envs.simulation import CopyRenderer
 from nht.envs.suite_copy import SuiteCopy

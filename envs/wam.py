@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from nht.envs.task import Array, BatchedTask, Flags
+from nht.envs.arrays import Array, Flags, Seed
+from nht.envs.task import BatchedTask
 from nht.envs.wam_kinematics import JOINT_HIGH, JOINT_LOW, MAX_SPEED, tool_pose
 
 BRAKE_ZONE = 0.15
@@ -47,7 +48,7 @@ class WAMTask(BatchedTask):
         *,
         num_envs: int,
         num_threads: int,
-        seed: int | None,
+        seed: Seed,
         success_radius: float,
         tilt_tolerance: float,
         terminate_on_failure: bool,

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import Array
+from nht.envs.arrays import Array
 
 SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE.value
 CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE.value

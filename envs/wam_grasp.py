@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, Flags, load_model
+from nht.envs.arrays import Array, Flags, Seed
+from nht.envs.models import ASSETS, load_model
 from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, WAMTask
 from nht.envs.wam_collision import ArmGeoms, Placed
 from nht.envs.wam_kinematics import damped_solve, forward_kinematics, tool_pose
@@ -66,7 +67,7 @@ class WAMGrasp(WAMTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         start_noise: float = 0.2,
         tilt_tolerance: float = math.pi / 16,

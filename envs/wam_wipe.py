@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from nht.envs.task import ASSETS, Array, Flags, load_model
+from nht.envs.arrays import Array, Flags, Seed
+from nht.envs.models import ASSETS, load_model
 from nht.envs.wam import BRAKE_HIGH, BRAKE_LOW, WAMTask, check_positive
 from nht.envs.wam_kinematics import damped_solve, forward_kinematics
 
@@ -60,7 +61,7 @@ class WAMWipe(WAMTask):
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        seed: int | None = None,
+        seed: Seed = None,
         *,
         start: Start = "fixed",
         swivel_range: float = 0.5,

@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nht.actuation_lipschitz import actuation_certificate
     from nht.alignment import Aligned, align
-    from nht.demos import Demos, load_demos, save_demos
+    from nht.demos import Demos
+    from nht.demos_folder import load_demos, save_demos
     from nht.export import export_map
     from nht.hdf5 import from_hdf5
     from nht.jacobian import JacobianPinv
     from nht.laser import CAE, LASER
     from nht.lipschitz import certificate, offset_certificate
     from nht.maps import NHT, SVD, ActionMap, Identity, LinearActionMap
-    from nht.minari import from_minari, to_minari
+    from nht.minari import from_minari
+    from nht.minari_writing import to_minari
     from nht.residual import Residual
     from nht.scl import SCL
     from nht.storage import load_map, save_map
@@ -28,14 +30,16 @@ if TYPE_CHECKING:
 _NAMES = {
     "actuation_lipschitz": ("actuation_certificate",),
     "alignment": ("Aligned", "align"),
-    "demos": ("Demos", "load_demos", "save_demos"),
+    "demos": ("Demos",),
+    "demos_folder": ("load_demos", "save_demos"),
     "export": ("export_map",),
     "hdf5": ("from_hdf5",),
     "jacobian": ("JacobianPinv",),
     "laser": ("CAE", "LASER"),
     "lipschitz": ("certificate", "offset_certificate"),
     "maps": ("NHT", "SVD", "ActionMap", "Identity", "LinearActionMap"),
-    "minari": ("from_minari", "to_minari"),
+    "minari": ("from_minari",),
+    "minari_writing": ("to_minari",),
     "residual": ("Residual",),
     "scl": ("SCL",),
     "storage": ("load_map", "save_map"),

@@ -58,7 +58,7 @@ class ActionMap(nn.Module, ABC):
     _recorded_arguments: ClassVar[dict[str, Any]] = {}
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Lets every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
+        """Let every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
         super().__init_subclass__(**kwargs)
         for name, wrap in (
             ("__init__", recording),
@@ -86,7 +86,7 @@ class ActionMap(nn.Module, ABC):
         self.register_buffer("actuation_high", torch.full((self.actuation_dim,), torch.inf))
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Lets a subclass have a layer called like one of the methods below, as many autoencoders do.
+        """Let a subclass have a layer called like one of the methods below, as many autoencoders do.
 
         ``forward`` and ``project`` of the subclass then find the layer; the method is ``type(map).encode(map, ...)``.
         """
@@ -170,7 +170,7 @@ class ActionMap(nn.Module, ABC):
 
     @torch.no_grad()
     def set_action_scale(self, value: float | Tensor) -> None:
-        """Sets what a policy's action of 1 stands for, in the map's own units.
+        """Set what a policy's action of 1 stands for, in the map's own units.
 
         Raises:
             ValueError: unless it is a single number, positive and finite, in the map's precision too.
@@ -192,7 +192,7 @@ class ActionMap(nn.Module, ABC):
         return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Prepares the map from all training data, before any gradient step.
+        """Prepare the map from all training data, before any gradient step.
 
         Returns:
             True if that was all the training it takes: a closed form.
@@ -228,7 +228,7 @@ class ActionMap(nn.Module, ABC):
 
 
 def _marked(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Lets no subclass wrap it again, and gives it code of its own: compilers count their attempts by that."""
+    """Let no subclass wrap it again, and give it code of its own: compilers count their attempts by that."""
     function = cast(FunctionType, method)
     function.__code__ = function.__code__.replace()
     setattr(function, WRAPPED, True)

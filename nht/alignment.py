@@ -69,7 +69,7 @@ class Aligned(LinearActionMap):
         return self.map.rest(context)
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Refuses, for a basis that learns would turn again.
+        """Refuse, for a basis that learns would turn again.
 
         Raises:
             ValueError: always.
@@ -83,7 +83,7 @@ class Aligned(LinearActionMap):
 
 @torch.no_grad()
 def align(map: ActionMap, directions: Tensor, context: Tensor, *, jacobian: Tensor | None = None) -> Aligned:
-    """Turns the axes of a trained map towards given directions: orthogonal Procrustes.
+    """Turn the axes of a trained map towards given directions: orthogonal Procrustes.
 
     Of all orthogonal matrices, reflections and sign flips among them, R is the one that brings the mean over the
     contexts of |Q(c) R - D(c)|^2 to its least, entries squared and summed. Given the Jacobian of a tool, that of

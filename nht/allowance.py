@@ -1,4 +1,4 @@
-"""How much memory a map's constructor may ask for: a file of two kilobytes could describe networks of any size."""
+"""How much memory a constructor may ask for: a file of two kilobytes could describe networks of any size."""
 
 from __future__ import annotations
 
@@ -11,15 +11,23 @@ FACTORIES = (torch.empty, torch.zeros, torch.ones, torch.full, torch.eye, torch.
 SLACK = 2**24  # [bytes]
 
 
+class FarLargerError(ValueError):
+    """What a file describes takes far more memory than what it holds."""
+
+
 class Allowance(TorchFunctionMode):
     """While this is entered, tensors that are made out of nothing may not be much larger than a file's weights.
 
+    ``FarLargerError`` is raised before the one too many is made.
+
     Args:
         size: of the weights that the file holds [bytes].
+        described: what it describes, for the message.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, described: str = "a map") -> None:
         super().__init__()
+        self.described = described
         self.size, self.left = size, 4 * size + SLACK  # what is made on the way counts too
 
     def __torch_function__(
@@ -30,9 +38,14 @@ class Allowance(TorchFunctionMode):
             sized = {
                 key: value for key, value in kwargs.items() if key not in ("generator", "out", "pin_memory")
             }
-            self.left -= func(*args, **sized | {"device": "meta"}).nbytes
+            try:
+                self.left -= func(*args, **sized | {"device": "meta"}).nbytes
+            except (RuntimeError, TypeError) as error:
+                if "overflow" not in str(error).lower():  # sizes that cannot be counted
+                    raise
+                self.left = -1
             if self.left < 0:
-                raise ValueError(
-                    f"describes a map far larger than the {self.size} bytes of weights that it holds."
+                raise FarLargerError(
+                    f"describes {self.described} far larger than the {self.size} bytes of weights that it holds."
                 )
         return func(*args, **kwargs)

@@ -23,7 +23,7 @@ def whole_episodes(
     episode_key: NestedKey | None = None,
     done_key: NestedKey | None = None,
 ) -> tuple[TensorDict, int]:
-    """Lays TorchRL's data out as demonstrations; episodes that do not end are left out.
+    """Lay TorchRL's data out as demonstrations; episodes that do not end are left out.
 
     Args:
         data: (T,), or (N, T) with a trajectory in each row; in order of time. What a step brought stands under
@@ -86,7 +86,7 @@ def _check_not_late(data: TensorDictBase, actuation_key: NestedKey) -> None:
 
 
 def _numbered(data: TensorDict, first: Tensor, number: Tensor | None) -> tuple[TensorDict, int]:
-    """Puts the rows of an episode together, numbers the episodes and drops those that do not end."""
+    """Put the rows of an episode together, number the episodes and drop those that do not end."""
     if number is not None:  # the ids of a collector alternate where its batches were stored one after another
         order = torch.argsort(number, stable=True)
         data, number = data[order], number[order]
@@ -146,7 +146,7 @@ def _parts(key: NestedKey) -> tuple[str, ...]:
 
 
 def check(data: TensorDictBase) -> None:
-    """Checks that data are whole episodes of finite numbers with an actuation.
+    """Check that data are whole episodes of finite numbers with an actuation.
 
     Raises:
         KeyError: if "actuation" or "episode" is missing.

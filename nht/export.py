@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from nht.action_map import ActionMap
-from nht.storage import describe, replacing
+from nht.description import describe
 from nht.torch_internals import write_machine_code
+from nht.writing import replacing
 
 SUFFIXES = (".pt2", ".onnx")
 
@@ -32,7 +33,7 @@ def export_map(
     high: Limits | None = None,
     compiled: bool = False,
 ) -> Path:
-    """Writes what a policy's action in [-1, 1]^k does: ``map.decode(action, context, low, high)``.
+    """Write what a policy's action in [-1, 1]^k does: ``map.decode(action, context, low, high)``.
 
     Inputs, in this order: "action" (batch, k) and "context" (batch, context_dim, which may be 0); output: "actuation"
     (batch, n). All are in the map's precision, and for any batch. Without limits, what happens at the robot's is left

@@ -47,7 +47,7 @@ def sphere_log(point: Tensor) -> Tensor:
 
 
 def reflect(reflectors: Tensor, vector: Tensor) -> Tensor:
-    """Applies H(v_1) ... H(v_k), where H(v) = I - 2 v v^T (Eq. 8, 9).
+    """Apply H(v_1) ... H(v_k), where H(v) = I - 2 v v^T (Eq. 8, 9).
 
     One by one, or, where that is faster (many reflectors, small batch), all at once: the same but for rounding.
 

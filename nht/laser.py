@@ -76,7 +76,7 @@ class CAE(ActionMap):
         return self.encoder(context, actuation)[..., : self.action_dim]
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normalisers; the weights are left to gradient steps."""
+        """Set the normalisers; the weights are left to gradient steps."""
         if self.normalise:
             for network in self.children():
                 assert isinstance(network, ContextNetwork)
@@ -175,7 +175,7 @@ class LASER(CAE):
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normalisers and the mean length of a change; the weights are left to gradient steps."""
+        """Set the normalisers and the mean length of a change; the weights are left to gradient steps."""
         super().fit(batch)
         if self.dynamics is not None:
             change = (batch["next", "context"] - batch["context"]) / self.dynamics.context_std

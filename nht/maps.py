@@ -124,7 +124,7 @@ class NHT(LinearActionMap):
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normaliser and where to start; the rest is left to gradient steps.
+        """Set the normaliser and where to start; the rest is left to gradient steps.
 
         A map that has been trained goes on from where it is.
         """

@@ -1,4 +1,4 @@
-"""TensorDicts in folders of raw files, as ``TensorDict.memmap`` lays them out: written, and read without trust.
+"""TensorDicts read without trust from folders of raw files, as ``TensorDict.memmap`` lays them out.
 
 A folder has a ``meta.json``, which says type, shape and batch size, one ``key.memmap`` of raw values for each tensor,
 and one folder for each TensorDict inside. TensorDict's own reader believes the ``meta.json``: it unpickles what is
@@ -8,7 +8,6 @@ first, maps privately, so that neither reading nor writing to a tensor can chang
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import stat
@@ -20,30 +19,9 @@ import torch
 from tensordict import LazyStackedTensorDict, NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
 
+from nht.memmap_files import DTYPES, META, PLAIN, STORAGE, file_name
 from nht.reading import entry, plain_file, read_json, shortened
 
-META, STORAGE = "meta.json", "storage_metadata.json"
-DTYPES = {
-    str(dtype): dtype
-    for dtype in (
-        torch.bool,
-        torch.uint8,
-        torch.uint16,
-        torch.uint32,
-        torch.uint64,
-        torch.int8,
-        torch.int16,
-        torch.int32,
-        torch.int64,
-        torch.float16,
-        torch.bfloat16,
-        torch.float32,
-        torch.float64,
-        torch.complex64,
-        torch.complex128,
-    )
-}
-PLAIN = "<class 'tensordict._td.TensorDict'>"
 STACK = "<class 'tensordict._lazy.LazyStackedTensorDict'>"
 DATA = "<class 'tensordict.tensorclass.NonTensorData'>"
 DATA_STACK = "<class 'tensordict.tensorclass.NonTensorStack'>"
@@ -207,52 +185,9 @@ def _named(folder: Path, key: str, suffix: str, where: str) -> Path:
     return found[0]
 
 
-def file_name(key: str) -> str:
-    """What TensorDict calls the file of a key: always a name within its folder."""
-    if key in ("", ".", ".."):
-        return "%2E" * len(key) or "%"
-    unsafe = set('/<>:"|?*\\ %\x7f')
-    return "".join(f"%{ord(char):02X}" if char in unsafe or ord(char) < 32 else char for char in key)
-
-
 def _shape(value: Any, where: object, name: str) -> list[int]:
     if not isinstance(value, list) or not all(type(size) is int and size >= 0 for size in value):
         raise ValueError(f"{where}: {name!r} must be a list of sizes, got {shortened(repr(value), 80)}.")
     if math.prod(value) >= 2**60:
         raise ValueError(f"{where}: {name!r} says {shortened(value, 80)}, more than any file holds.")
     return value
-
-
-def write_tensordict(data: TensorDictBase, folder: Path) -> None:
-    """Write a TensorDict of tensors into a new folder, as ``TensorDict.memmap`` lays it out.
-
-    Written like any file: on a full disk it says so, where writing into mapped memory kills the process.
-
-    Raises:
-        OSError: if there is no room.
-        ValueError: on an entry that is no tensor.
-    """
-    folder.mkdir(parents=True)
-    record: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, TensorDictBase):
-            write_tensordict(value, folder / file_name(key))
-            record[key] = {"type": "TensorDict"}
-            continue
-        if not isinstance(value, Tensor):
-            raise ValueError(f"only tensors are written, but key {key!r} holds a {type(value).__name__}.")
-        record[key] = {
-            "device": "cpu",
-            "shape": list(value.shape),
-            "dtype": str(value.dtype),
-            "is_nested": False,
-        }
-        if value.numel():
-            (folder / f"{file_name(key)}.memmap").write_bytes(raw(value))
-    record |= {"shape": list(data.batch_size), "device": "cpu", "_type": PLAIN}
-    (folder / META).write_text(json.dumps(record, separators=(",", ":")))
-
-
-def raw(value: Tensor) -> memoryview:
-    """The bytes of a tensor's values, in order."""
-    return value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data

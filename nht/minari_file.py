@@ -8,7 +8,6 @@ of picture they turn out to be.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,17 @@ from typing import Any
 import numpy as np
 
 from nht.hdf5_file import check_file, find, opened
+from nht.minari_internals import (
+    DATA,
+    FOLDER,
+    JPEG,
+    METADATA,
+    datasets_root,
+    episode_entry,
+    tuple_entry,
+)
 from nht.reading import entry, parse_json, plain_file, read_json, shortened
 
-METADATA, DATA = "metadata.json", "main_data.hdf5"
 TRUST = (
     "If you trust the dataset, open it yourself and hand it over: "
     "nht.from_minari(minari.MinariDataset(folder)) or nht.from_minari(minari.load_dataset(id))."
@@ -26,19 +33,11 @@ TRUST = (
 DEEPEST = 32
 """Spaces within spaces."""
 
-JPEG = b"\xff\xd8\xff"
-"""What every JPEG file begins with; Minari stores frames so."""
-
-
-def datasets_root() -> Path:
-    """Where Minari keeps local datasets; not made if it is not there."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
-
 
 def local_datasets() -> list[str]:
     """Ids of the datasets that are here."""
     root = datasets_root()
-    return sorted(str(file.parent.parent.relative_to(root)) for file in root.glob(f"**/data/{METADATA}"))
+    return sorted(str(file.parent.parent.relative_to(root)) for file in root.glob(f"**/{FOLDER}/{METADATA}"))
 
 
 def check_dataset(folder: Path) -> None:
@@ -75,7 +74,7 @@ def check_dataset(folder: Path) -> None:
         if about.get("jpeg_encoding", True):
             for episode in range(about["total_episodes"]):
                 for name, space in spaces.items():
-                    _check_frames(handle, f"episode_{episode}/{name}s", space)
+                    _check_frames(handle, episode_entry(episode, f"{name}s"), space)
 
 
 def _space(about: dict[str, Any], name: str, file: Path) -> dict[str, Any]:
@@ -139,7 +138,7 @@ def _check_frames(file: Any, key: str, space: dict[str, Any]) -> None:
         pairs = (
             inner.items()
             if isinstance(inner, dict)
-            else ((f"_index_{i}", one) for i, one in enumerate(inner))
+            else ((tuple_entry(i), one) for i, one in enumerate(inner))
         )
         for name, one in pairs:
             _check_frames(file, f"{key}/{name}", one)

@@ -31,7 +31,7 @@ class Heads(nn.Module):
         self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in layers]))
 
     def forward(self, value: Tensor) -> Tensor:
-        """Maps (*batch, heads * input_dim) to (*batch, heads * output_dim)."""
+        """Map (*batch, heads * input_dim) to (*batch, heads * output_dim)."""
         shares = value.unflatten(-1, (len(self.weight), -1)).unsqueeze(-1)
         return ((self.weight @ shares).squeeze(-1) + self.bias).flatten(-2)
 
@@ -87,7 +87,7 @@ class ContextNetwork(nn.Module):
         self.register_buffer("context_std", torch.ones(context_dim))
 
     def forward(self, context: Tensor, *others: Tensor) -> Tensor:
-        """Maps (*batch, context_dim), and others (*batch, width), to (*batch, output_dim)."""
+        """Map (*batch, context_dim), and others (*batch, width), to (*batch, output_dim)."""
         value = (context - self.context_mean) / self.context_std
         if others:
             value = torch.cat([value, *others], dim=-1)
@@ -103,7 +103,7 @@ class ContextNetwork(nn.Module):
 
     @torch.no_grad()
     def normalise(self, context: Tensor) -> None:
-        """Takes mean and deviation from contexts (T, context_dim).
+        """Take mean and deviation from contexts (T, context_dim).
 
         Deviations much smaller than the largest are raised: what hardly moves in the demonstrations, a height
         over a table for example, would become the loudest input as soon as it moves more.
@@ -115,20 +115,20 @@ class ContextNetwork(nn.Module):
 
     @torch.no_grad()
     def start_from_one_output(self, size: float, seed: int) -> None:
-        """Lets all contexts start from nearly the same output, normally distributed with deviation ``size``."""
+        """Let all contexts start from nearly the same output, normally distributed with deviation ``size``."""
         head = self.linear(-1)
         head.weight.mul_(0.1)
         head.bias.normal_(std=size, generator=torch.Generator().manual_seed(int(seed)))
 
     @torch.no_grad()
     def start_from(self, output: Tensor) -> None:
-        """Gives all contexts this very output, (output_dim,), until gradient steps tell them apart."""
+        """Give all contexts this very output, (output_dim,), until gradient steps tell them apart."""
         head = self.linear(-1)
         head.weight.zero_()
         head.bias.copy_(output.view_as(head.bias))
 
 
 def check_choice(name: str, given: str, allowed: Sequence[str]) -> None:
-    """Raises ValueError unless what was given for the argument ``name`` is allowed."""
+    """Raise ValueError unless what was given for the argument ``name`` is allowed."""
     if given not in allowed:
         raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {given!r}.")

@@ -30,7 +30,7 @@ class ConstantOffset(nn.Module):
 
     @torch.no_grad()
     def fit(self, context: Tensor, actuation: Tensor, *, normalise: bool = False) -> None:
-        """Sets u0 to the mean of actuations (T, n)."""
+        """Set u0 to the mean of actuations (T, n)."""
         self.value.copy_(actuation.mean(0))
 
 
@@ -57,7 +57,7 @@ class NetworkOffset(nn.Module):
         return cast(Tensor, self.network(context))
 
     def fit(self, context: Tensor, actuation: Tensor, *, normalise: bool = False) -> None:
-        """Lets u0 be the mean of actuations (T, n) in every context; takes the normaliser from contexts, if asked."""
+        """Let u0 be the mean of actuations (T, n) in every context; take the normaliser from contexts, if asked."""
         if normalise:
             self.network.normalise(context)
         self.network.start_from(actuation.mean(0))
@@ -99,7 +99,7 @@ Offset = ConstantOffset | NetworkOffset | LinearOffset
 
 
 def check_offset(kind: str, context_dim: int) -> None:
-    """Raises ValueError for an offset that does not exist, or a contextual one without a context."""
+    """Raise ValueError for an offset that does not exist, or a contextual one without a context."""
     check_choice("offset", kind, get_args(OffsetKind))
     if kind == "contextual" and context_dim < 1:
         raise ValueError(f"offset='contextual' needs a context, got context_dim={context_dim}.")

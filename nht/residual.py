@@ -63,7 +63,7 @@ class Residual(ActionMap):
         return self.map.rest(context)
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Refuses, for with corrections every actuation is reached, whatever the map.
+        """Refuse, for with corrections every actuation is reached, whatever the map.
 
         Raises:
             ValueError: always.

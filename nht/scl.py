@@ -85,7 +85,7 @@ class SCL(LinearActionMap):
         return missed.square().sum(-1).mean() + self.offset_loss(way)
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Sets the normaliser and where u0 starts; the weights are left to gradient steps."""
+        """Set the normaliser and where u0 starts; the weights are left to gradient steps."""
         if self.normalise:
             self.network.normalise(batch["context"])
         untrained = self.data_fingerprint is None

@@ -22,11 +22,11 @@ from torch import Tensor
 
 from nht.action_map import ActionMap
 from nht.allowance import Allowance
-from nht.arguments import plain
 from nht.description import describe, of_version_1, twin
-from nht.replacing import replacing
+from nht.storable import check_storable, state_of
+from nht.writing import replacing
 
-__all__ = ["check_storable", "describe", "load_map", "replacing", "save_map"]
+__all__ = ["format_version", "load_map", "save_map"]
 
 FORMAT = "nht.action_map"
 FORMAT_VERSION = 2
@@ -34,7 +34,7 @@ LONGEST_REASON = 600  # characters of what an error says about a file
 
 
 def save_map(map: ActionMap, path: str | Path) -> Path:
-    """Writes a map to one file; a reader sees the old file or the whole new one, never a part.
+    """Write a map to one file; a reader sees the old file or the whole new one, never a part.
 
     Normaliser, scale and bounds are buffers and therefore among the weights. The header has the class, by module and
     name, the constructor's arguments, the context's keys in order and the saturation; for whoever reads only the header
@@ -48,7 +48,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
         ValueError: if a weight is not finite, or a map loaded from the file would be another one.
     """
     path = Path(path)
-    tensors = _tensors(map)
+    tensors = state_of(map)
     _check_finite(tensors, check_storable(map).state_dict())
     text = json.dumps(describe(map))
     header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": text}
@@ -60,7 +60,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
 
 
 def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Sequence[str] = ()) -> ActionMap:
-    """Reads a map, ready to use: in eval mode, its parameters without gradients.
+    """Read a map, ready to use: in eval mode, its parameters without gradients.
 
     A class of your own is found if its module is imported, or is, or lies in, one of those in ``allow``, which are then
     imported. Files of format version 1 load as they did; they clip actuations.
@@ -85,59 +85,6 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
         reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
         raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}.") from error
     return map.to(device).eval().requires_grad_(False)
-
-
-@torch.no_grad()
-def check_storable(map: ActionMap) -> ActionMap:
-    """Builds the twin that a file of this map would give, so that what cannot be saved shows before it is trained.
-
-    Returns:
-        The twin: constructed alike, not trained.
-
-    Raises:
-        TypeError: if an argument of the constructor cannot stand in a file, or the state is not all of tensors.
-        ValueError: if the twin is another map.
-    """
-    refused = f"{type(map).__name__} could not be loaded after saving"
-    given = _listed(map)
-    try:
-        other = type(map)(*map.init_positional(), **map.init_args())
-    except Exception as error:  # of a constructor of any kind
-        raise ValueError(f"{refused}: {given} raise {type(error).__name__}: {error}") from error
-    if (again := _listed(other)) != given:
-        raise ValueError(
-            f"{refused}: an attribute named like an argument of the constructor must be that argument, but "
-            f"{given} turns into {again}."
-        )
-    shapes, expected = (
-        {(key, value.shape) for key, value in state.items()} for state in (other.state_dict(), _tensors(map))
-    )
-    if shapes != expected:
-        raise ValueError(f"{refused}: constructed again, its weights differ: {sorted(shapes ^ expected)}.")
-    return other
-
-
-def _listed(map: ActionMap) -> str:
-    """The constructor's arguments, as text to compare."""
-
-    def listed(value: Any) -> Any:
-        if isinstance(value, ActionMap):
-            return {type(value).__name__: [listed(value.init_positional()), listed(value.init_args())]}
-        if isinstance(value, dict):
-            return {key: listed(one) for key, one in value.items()}
-        return [listed(one) for one in value] if isinstance(value, list | tuple) else plain(value)
-
-    return json.dumps(listed(map))
-
-
-def _tensors(map: ActionMap) -> dict[str, Tensor]:
-    """The state as it is written: on the CPU, tied weights each on their own."""
-    state = map.state_dict()
-    if strange := [key for key, value in state.items() if not isinstance(value, Tensor)]:
-        raise TypeError(
-            f"the state of {type(map).__name__} has entries that are no tensors: {', '.join(strange)}."
-        )
-    return {key: value.detach().cpu().contiguous().clone() for key, value in state.items()}
 
 
 def _checksum(text: str, tensors: dict[str, Tensor]) -> str:
@@ -194,7 +141,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
 
 
 def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
-    """Loads the weights, all of them and no others, in the precision they were saved in."""
+    """Load the weights, all of them and no others, in the precision they were saved in."""
     name, untrained = type(map).__name__, map.state_dict()
     if untrained.keys() != tensors.keys():
         raise ValueError(

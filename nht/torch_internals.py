@@ -9,7 +9,7 @@ from torch.export import ExportedProgram
 
 
 def write_machine_code(program: ExportedProgram, path: Path, metadata: dict[str, str]) -> None:
-    """Compiles an exported program for this kind of processor, into a package for C++ and Python.
+    """Compile an exported program for this kind of processor, into a package for C++ and Python.
 
     Relies on ``torch._inductor.aoti_compile_and_package`` and its option ``aot_inductor.metadata``: the compiled
     package gives these entries back as its metadata. PyTorch documents both, under this private name alone.

@@ -9,16 +9,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from nht.demos import Demos
 from nht.lipschitz import LipschitzProjection, certificate
 from nht.maps import ActionMap, LinearActionMap
-from nht.storage import check_storable
+from nht.storable import check_storable
+from nht.training_data import context_keys_of, split_episodes, training_data
 
 EVALUATE_EVERY = 250  # gradient steps
-RANK_TOLERANCE = 1e-5  # actuations' singular values below this share of the largest one are rounding
 CHUNK = 65_536  # transitions projected at once when measuring
 
 Progress = Callable[[dict[str, float]], None]
@@ -51,7 +51,7 @@ def train_map(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> MapTraining:
-    """Trains a map in place, on its own device, and keeps the weights that were best on held-out episodes.
+    """Train a map in place, on its own device, and keep the weights that were best on held-out episodes.
 
     If ``map.fit`` is no closed form, Adam follows ``map.loss``, with a learning rate that falls to 0 along a
     cosine. The map also learns its context keys, action scale, bounds and the fingerprint of the data.
@@ -76,8 +76,8 @@ def train_map(
     _check_numbers(batch_size, learning_rate, max_steps, patience, validation_share)
     check_storable(map)
     start = time.perf_counter()
-    keys = _context_keys(demos, map, context_keys)
-    data = _training_data(demos, map, keys)
+    keys = context_keys_of(demos, map, context_keys)
+    data = training_data(demos, map, keys)
     held_out = split_episodes(demos.episode, validation_share, seed)
     training, validation = data[~held_out], data[held_out]
 
@@ -124,25 +124,10 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
     return missed / total
 
 
-def split_episodes(episode: Tensor, share: float, seed: int) -> Tensor:
-    """Holds out a share of the episodes, at least one, never all: (T,) -> (T,) bool, true where held out.
-
-    Of a single episode its last steps are held out: neighbours in time are too alike to be drawn at random.
-    """
-    names = torch.unique(episode)
-    if len(names) == 1 and len(episode) > 1:
-        return torch.arange(len(episode)) >= len(episode) - max(1, round(share * len(episode)))
-    if len(names) < 2:
-        raise ValueError(f"at least 2 transitions are needed, to hold one out, but there is {len(episode)}.")
-    count = min(max(1, round(share * len(names))), len(names) - 1)
-    order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))
-    return torch.isin(episode, names[order[:count]])
-
-
 def _gradient_steps(
     map: ActionMap, data: TensorDictBase, batch_size: int, learning_rate: float, max_steps: int, seed: int
 ) -> Iterator[tuple[int, float]]:
-    """Yields step and loss every EVALUATE_EVERY steps, when the map is exactly within its limit."""
+    """Yield step and loss every EVALUATE_EVERY steps, when the map is exactly within its limit."""
     generator = torch.Generator().manual_seed(seed)
     optimiser = torch.optim.Adam(map.parameters(), lr=learning_rate, fused=True)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max_steps)
@@ -166,7 +151,7 @@ def _gradient_steps(
 def _batches(
     data: TensorDictBase, batch_size: int, count: int, generator: torch.Generator
 ) -> Iterator[TensorDictBase]:
-    """Yields batches of random rows; those of many steps are gathered at once, as each gathering has its price."""
+    """Yield batches of random rows; those of many steps are gathered at once, as each gathering has its price."""
     for start in range(0, count, EVALUATE_EVERY):
         steps = min(EVALUATE_EVERY, count - start)
         rows = torch.randint(len(data), (steps, batch_size), generator=generator)
@@ -180,7 +165,7 @@ def _keep_best(
     patience: int,
     progress: Progress | None,
 ) -> tuple[int, int]:
-    """Trains until the validation error stops falling: the steps made, and the step of the best weights."""
+    """Train until the validation error stops falling: the steps made, and the step of the best weights."""
     start = time.perf_counter()
     # The start counts, too: a map that starts at the best plane never ends below it.
     best_error, best_step, step = projection_error(map, validation["context"], validation["actuation"]), 0, 0
@@ -201,60 +186,6 @@ def _keep_best(
         raise FloatingPointError(f"training diverged in the first {step} steps; lower learning_rate.")
     map.load_state_dict(best_weights)
     return step, best_step
-
-
-def _context_keys(
-    demos: Demos, map: ActionMap, context_keys: Sequence[NestedKey] | None
-) -> tuple[NestedKey, ...]:
-    if context_keys is not None:
-        return tuple(context_keys)
-    if map.context_keys is not None:
-        return map.context_keys
-    if map.context_dim == 0:
-        return ()
-    if "context" in demos.data:
-        return ("context",)
-    raise ValueError(
-        f"context_keys must name some of the demonstrations' keys: {', '.join(demos.manifest['keys'])}."
-    )
-
-
-def _training_data(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> TensorDict:
-    """Context and actuation of all transitions, in memory, in the map's precision and on its device."""
-    context, actuation = demos.context(keys), demos.actuation
-    if actuation.shape[-1] != map.actuation_dim:
-        raise ValueError(
-            f"demonstrated actuations have {actuation.shape[-1]} dimensions, the map's {map.actuation_dim}."
-        )
-    if context.shape[-1] != map.context_dim:
-        widths = ", ".join(f"{key!r}: {demos.data[key].shape[-1]}" for key in keys)
-        raise ValueError(
-            f"the map's context has width {map.context_dim}, the keys give {context.shape[-1]}: {widths}."
-        )
-    affine = isinstance(map, LinearActionMap) and map.offset_model is not None
-    spread = actuation.double() - actuation.double().mean(0) if affine else actuation.double()
-    singular = torch.linalg.svdvals(spread)
-    rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
-    if map.learns and rank < map.action_dim < map.actuation_dim:
-        raise ValueError(
-            f"the demonstrations have {rank} independent actuations"
-            f"{', measured from their mean' if affine else ''}, too few for k = {map.action_dim}."
-        )
-    data = TensorDict({"context": context, "actuation": actuation}, batch_size=len(actuation))
-    if map.needs_next_context:
-        data["next", "context"] = _next_context(demos, map, keys)
-    return data.to(map.action_scale.device, map.action_scale.dtype)
-
-
-def _next_context(demos: Demos, map: ActionMap, keys: Sequence[NestedKey]) -> Tensor:
-    following = [("next", *((key,) if isinstance(key, str) else key)) for key in keys]
-    missing = [key for key in following if key not in demos.data.keys(include_nested=True)]
-    if missing:
-        raise KeyError(
-            f"{type(map).__name__} learns from the next context too, but the demonstrations lack "
-            f"{', '.join(repr(key) for key in missing)}; a LASER with beta_dynamics=0 does without."
-        )
-    return demos.context(following)
 
 
 @torch.no_grad()

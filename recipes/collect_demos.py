@@ -26,7 +26,7 @@ from nht.recipes.data.recording import COPIES, endings, has_success, record, rec
 from nht.recipes.launch import launch
 from nht.recipes.maps.kinds import known_task, task_context_keys
 from nht.recipes.run.environments import mapped_env
-from nht.recipes.run.folder import kept_map, read_config
+from nht.recipes.run.saved_run import kept_map, read_config
 from nht.recipes.sections import DemosConfig, EnvConfig, SourceConfig
 
 

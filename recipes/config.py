@@ -119,12 +119,13 @@ class SearchConfig:
     total_frames: int = 1_000_000  # environment steps of a run
     best_seeds: int = 5  # fresh ones, on which the best configuration of each interface is run again
     best_frames: int = 1_000_000  # environment steps of those runs
+    learners: int = 1  # runs that train together in one process, as far as their learners are of one shape
     base: list[str] = field(default_factory=list)  # what every run is told, as on the recipe's command line
     space: dict[str, Any] = field(default_factory=dict)  # see recipes/study/space.py
 
     def __post_init__(self) -> None:
         """Raise ValueError for a search of nothing, or by what runs do not report."""
-        for name in ("configs", "seeds", "total_frames", "best_frames"):
+        for name in ("configs", "seeds", "total_frames", "best_frames", "learners"):
             if getattr(self, name) < 1:
                 raise ValueError(f"search.{name} must be at least 1, got {getattr(self, name)}.")
         if self.best_seeds < 0:

@@ -1,13 +1,16 @@
 """DDPG through an action map (Lillicrap et al. 2016; the paper's own settings: ``algo=ddpg_paper``).
 
 python -m nht.recipes.ddpg env=wam_wipe map=nht seed=0
+python -m nht.recipes.ddpg env=wam_wipe map=nht seeds=16
 """
 
 from __future__ import annotations
 
-import torch
+from functools import partial
+
 from tensordict.nn import TensorDictSequential
 
+from nht.recipes.agents.adam import LearnersAdam
 from nht.recipes.agents.ddpg import DDPG, PaperDDPGLoss, networks
 from nht.recipes.agents.off_policy import (
     JointSoftUpdate,
@@ -20,50 +23,62 @@ from nht.recipes.agents.off_policy import (
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.evaluation import evaluate
-from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.learners import Learners
 from nht.recipes.run.loop import Loop
+from nht.recipes.run.population import open_run
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
 
 
-def main(config: DDPG) -> None:
-    """Train, evaluate on the way, and say at the end what happened."""
-    algo = config.algo
-    ranks = Ranks(config.device, seed=config.seed, threads=config.torch_threads)
-    folder = RunFolder(config, ranks)
+def main(*configs: DDPG, together: str | None = None) -> None:
+    """Train one learner, or several of one shape at once; evaluate on the way, and say at the end what happened."""
+    ranks = Ranks(configs[0].device, seed=configs[0].seed, threads=configs[0].torch_threads)
+    folder = open_run(configs, ranks, together)
     if folder.whole:
         return folder.show()
-    envs = RunEnvs(folder.config, folder.map, ranks)
+    learners = Learners(folder.configs, ranks.device)
+    algo = learners.algo
+    envs = RunEnvs(folder.configs, folder.maps, ranks)
     record = Record(folder, ranks, envs, losses=["loss_actor", "loss_value"])
 
-    features, actor, critic = networks(envs.train, algo)
+    features, actor, critic = learners.networks(partial(networks, envs.train))
     policy = TensorDictSequential(features, actor)
     rewards = reward_range(envs.train)
     loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
-    optimiser = torch.optim.Adam(
+    optimiser = LearnersAdam(
         [
-            {"params": list(loss.actor_network_params.values(True, True)), "lr": algo.actor_learning_rate},
-            {"params": list(loss.value_network_params.values(True, True)), "lr": algo.critic_learning_rate},
-        ],
-        fused=True,
+            (loss.actor_network_params.values(True, True), algo.actor_learning_rate),
+            (loss.value_network_params.values(True, True), algo.critic_learning_rate),
+        ]
     )
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
-    batch_size = ranks.share("algo.batch_size", algo.batch_size)
+    batch_size = learners.each(ranks.share("algo.batch_size", algo.batch_size))
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     explorer = exploring(policy, envs.train, algo)
-    loop = Loop(folder, ranks, envs, record, explorer, loss, random_frames=algo.random_frames, **parts)
+    loop = Loop(
+        folder,
+        ranks,
+        envs,
+        record,
+        explorer,
+        loss,
+        learners=learners,
+        random_frames=algo.random_frames,
+        **parts,
+    )
 
     with loop.batches() as batches:
-        for data in batches:  # (copies, steps)
+        for data in batches:  # (copies, steps), or (learners, copies, steps)
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
             buffer.extend(storable(look_ahead(charge_failure(data, algo.gamma, rewards))))
 
             if record.frames >= algo.warmup_frames:
-                for batch in minibatches(buffer, algo.updates_per_batch, batch_size, features, ranks.device):
+                for batch in minibatches(
+                    buffer, algo.updates_per_batch, batch_size, features, ranks.device, learners.draws
+                ):
                     losses = loss(batch)
                     descend([losses["loss_actor"], losses["loss_value"]], optimiser, ranks)
                     record.count_update(losses)
@@ -71,7 +86,7 @@ def main(config: DDPG) -> None:
                         target.step()
 
             if record.evaluation_due:
-                record.log(evaluate(envs.test, policy))
+                record.evaluate(policy)
     loop.finish(policy)
 
 

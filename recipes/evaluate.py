@@ -15,7 +15,7 @@ from nht.recipes.config import Evaluate
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import lasting_failures, mapped_env
 from nht.recipes.run.evaluation import evaluate
-from nht.recipes.run.folder import kept_map, read_config
+from nht.recipes.run.saved_run import kept_map, read_config
 from nht.recipes.run.video import record_video
 
 

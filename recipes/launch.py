@@ -227,7 +227,7 @@ def _primary(schema: type[Any], name: str) -> str:
 
 
 def _opened(node: DictConfig) -> DictConfig:
-    """Lets the dictionaries in it take new keys, which their readers check; dataclasses stay as they are."""
+    """Let the dictionaries in it take new keys, which their readers check; dataclasses stay as they are."""
     for key in node:
         value = None if OmegaConf.is_missing(node, key) else node[key]
         if isinstance(value, DictConfig):

@@ -13,7 +13,6 @@ from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_ra
 from nht.recipes.agents.sac import SAC, DirectSACLoss, networks
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
@@ -75,7 +74,7 @@ def main(config: SAC) -> None:
                     record.count_update(losses)
 
             if record.evaluation_due:
-                record.log(evaluate(envs.test, policy))
+                record.evaluate(policy)
     loop.finish(policy)
 
 

@@ -24,11 +24,12 @@ from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.metrics import FRAMES
 from nht.recipes.run.ownership import claimed
 from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
+from nht.recipes.study.packs import Pack, packed, run_pack
 from nht.recipes.study.report import summary
 from nht.recipes.study.results import SearchResults, read_results
 from nht.recipes.study.rows_file import COLUMNS
 from nht.recipes.study.space import draw, write_manifest
-from nht.storage import replacing
+from nht.writing import replacing
 
 if TYPE_CHECKING:
     from nht.recipes.study.cluster import Cluster
@@ -47,16 +48,19 @@ def main(config: Search) -> None:
     demos = Path(config.demos.path or folder / "demos").resolve()
     jobs = search_jobs(search, demos)
     check_settings(jobs, folder)
+    packed(jobs, search.learners)  # whether the algorithm trains several
     from nht.recipes.study.cluster import Cluster  # Ray is an extra of its own
 
-    write_manifest(folder / "manifest.json", asdict(search) | {"demos": asdict(config.demos)})
+    settings = asdict(search) | {"demos": asdict(config.demos)}
+    del settings["learners"]  # decides nothing but the cost
+    write_manifest(folder / "manifest.json", settings)
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
         if config.demos.path is None:
             record_demos(config, folder, demos)
         ended = known_rows(folder, config.retry_failed)
-        run_all(jobs, folder, cluster, ended)
+        run_all(jobs, folder, cluster, ended, search.learners)
         if search.best_seeds:
-            run_all(best_jobs(search, demos, ended), folder, cluster, ended)
+            run_all(best_jobs(search, demos, ended), folder, cluster, ended, search.learners)
     print(summary(SearchResults.of(together(ended))).to_string(index=False))
     print(f"\n{folder}: manifest.json, rows.csv; figures: python -m nht.recipes.report {config.folder}")
 
@@ -159,7 +163,19 @@ def task_env(search: SearchConfig) -> Any:
     return configure(schema, search.recipe, [f"env={search.env}", "map=none", *search.base]).env
 
 
-def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: Rows) -> None:
+def tasks_of(
+    jobs: Sequence[Job], missing: Sequence[Job], learners: int, cluster: Cluster, folder: Path
+) -> Iterator[Job | Pack]:
+    """Have the missing runs done, one by one or in packs, and give each task back once it is."""
+    if learners == 1:
+        yield from cluster.run(run_job, missing, folder)
+        return
+    names = {job.name for job in missing}
+    packs = [pack for pack in packed(jobs, learners) if any(job.name in names for job in pack.jobs)]
+    yield from cluster.run(run_pack, packs, folder)
+
+
+def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: Rows, learners: int = 1) -> None:
     """Run those jobs of a stage that have not ended, and keep ``rows.csv`` up to date.
 
     Args:
@@ -167,6 +183,7 @@ def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: Rows) ->
         folder: of the search.
         cluster: where they run.
         ended: the rows of all runs that have, which grows.
+        learners: how many train together, at most.
     """
     ended |= {
         job.name: rows_of(job, folder)
@@ -176,11 +193,12 @@ def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: Rows) ->
     with progress(jobs, folder) as show:
         show(ended)
         while missing := [job for job in jobs if job.name not in ended]:
-            for job in cluster.run(run_job, missing, folder):
-                if Ending.read(folder / job.name) is None:
-                    continue  # another process is at it
-                ended[job.name] = rows_of(job, folder)
-                write_rows(folder, ended)
+            for task in tasks_of(jobs, missing, learners, cluster, folder):
+                for job in task.jobs:
+                    if job.name in ended or Ending.read(folder / job.name) is None:
+                        continue  # it was there, or another process is at it
+                    ended[job.name] = rows_of(job, folder)
+                    write_rows(folder, ended)
                 show(ended)
             if any(job.name not in ended for job in jobs):
                 time.sleep(POLL)

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 DEFAULT_SCALE = "default"
 """Of ``map.action_scale``: what the kind of map says."""
+
+MOST_THREADS = 1_024
+"""That a task may be stepped by: each has a simulation of its own, and a configuration may be a stranger's."""
 
 
 def path_field(default: str | None) -> Any:
@@ -30,12 +33,14 @@ class EnvConfig:
     options: dict[str, Any] = field(default_factory=dict)  # of the task itself, in training and in evaluation
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a task without a name."""
+        """Raise ValueError for a task without a name, or more threads than any machine has."""
         if not self.name:
             raise ValueError(
                 f"env.name must name a task of {self.suite}, for torchrl what makes it: "
                 "env.name=my_package.robots:make."
             )
+        if not 1 <= self.num_threads <= MOST_THREADS:
+            raise ValueError(f"env.num_threads must be in 1 ... {MOST_THREADS}, got {self.num_threads}.")
 
 
 @dataclass
@@ -112,7 +117,12 @@ class MapConfig:
 
 @dataclass
 class AlgoConfig:
-    """What every algorithm has: how many environment steps, and how many of them between two rounds of updates."""
+    """What every algorithm has: how many environment steps, and how many of them between two rounds of updates.
+
+    ``varies`` names the settings in which learners that share every call may differ; none, if they cannot share any.
+    """
+
+    varies: ClassVar[tuple[str, ...]] = ()
 
     total_frames: int = 100_000  # environment steps of the whole run, of all copies together
     frames_per_batch: int = 200  # environment steps between two rounds of updates
@@ -146,6 +156,7 @@ class EvaluationConfig:
 
     every: int = 10_000  # frames between two evaluations
     episodes: int = 100  # in each, one copy of the task for every episode
+    final_episodes: int | None = None  # in the last one; None is as many
     video: bool = True  # of the final policy
 
 
@@ -179,6 +190,7 @@ class Training:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     run: RunConfig = field(default_factory=RunConfig)
     seed: int = 0  # of every random draw
+    seeds: int | None = None  # learners to train together, of seed, seed + 1 ..., each in a folder of its own
     device: str = "cpu"  # where networks and batches are: cpu, cuda or cuda:1
     torch_threads: int = 1  # of each process
 

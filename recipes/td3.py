@@ -20,7 +20,6 @@ from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_ra
 from nht.recipes.agents.td3 import TD3, DirectTD3Loss, networks
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
@@ -82,7 +81,7 @@ def main(config: TD3) -> None:
                     record.count_update(losses)
 
             if record.evaluation_due:
-                record.log(evaluate(envs.test, policy))
+                record.evaluate(policy)
     loop.finish(policy)
 
 

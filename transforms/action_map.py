@@ -118,7 +118,7 @@ class ActionMapTransform(Attachment):
         return self.map.action_scale
 
     def train(self, mode: bool = True) -> ActionMapTransform:
-        """Sets the mode of this module, not that of the map."""
+        """Set the mode of this module, not that of the map."""
         super().train(mode)
         self.map.eval()
         return self
@@ -170,7 +170,7 @@ class ActionMapTransform(Attachment):
         return tensordict_reset.set(self.executed_key, idle)
 
     def _see_to_context(self, observed: TensorDictBase) -> None:
-        """Reads it, or makes sure that what was read early is still there."""
+        """Read it, or make sure that what was read early is still there."""
         if not self.context_keys:
             return
         if not self.reads_early:

@@ -105,13 +105,13 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Resets the environment and reads the context."""
+        """Reset the environment and read the context."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._context = self._mapping.context(observation, info)
         return observation, info
 
     def step(self, action: Floats) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Executes the actuation that stands for ``action`` (k,)."""
+        """Execute the actuation that stands for ``action`` (k,)."""
         actuation = self._mapping.actuation(action, self._context)
         observation, reward, terminated, truncated, info = self.env.step(actuation.copy())
         self._context = self._mapping.context(observation, info)
@@ -175,7 +175,7 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Resets the copies, or those in ``options["reset_mask"]`` (N,), and reads their context."""
+        """Reset the copies, or those in ``options["reset_mask"]`` (N,), and read their context."""
         everyone = np.ones(self.num_envs, dtype=bool)
         mask = (options or {}).get("reset_mask", everyone)  # read first: environments may take it out
         if self._context is None and not np.all(mask):
@@ -187,7 +187,7 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
         return observations, infos
 
     def step(self, actions: Floats) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Executes the actuations that stand for ``actions`` (N, k)."""
+        """Execute the actuations that stand for ``actions`` (N, k)."""
         actuation = self._mapping.actuation(actions, self._context)
         observations, rewards, terminations, truncations, infos = self.env.step(actuation.copy())
         self._context = self._mapping.context(observations, infos)

@@ -72,11 +72,11 @@ class Attachment(EarlyReader):
         self._is_current = False
 
     def read_raw(self, observed: TensorDictBase) -> None:
-        """Writes the context to its key."""
+        """Write the context to its key."""
         observed.set(self.context_key, read_context(observed, self.context_keys, self.dtype))
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Attaches the transform to an environment, or to a Compose that may be attached to one already."""
+        """Attach the transform to an environment, or to a Compose that may be attached to one already."""
         super().set_container(container)
         self._attach()
 
@@ -95,7 +95,7 @@ class Attachment(EarlyReader):
         return action_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Registers what is added to the data: collectors drop what is not in the specs."""
+        """Register what is added to the data: collectors drop what is not in the specs."""
         self._attach()
         executed_spec = self._executed_spec
         if (device := observation_spec.device) is not None:
@@ -106,7 +106,7 @@ class Attachment(EarlyReader):
         return self._with_context(observation_spec)
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Registers the context as an input too: worker processes are sent nothing else along with the action."""
+        """Register the context as an input too: worker processes are sent nothing else along with the action."""
         return self._with_context(state_spec)
 
     def _with_context(self, spec: Composite) -> Composite:
@@ -114,18 +114,17 @@ class Attachment(EarlyReader):
             spec[self.context_key] = Unbounded(self._context_shape, dtype=self.dtype, device=spec.device)
         return spec
 
-    def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """TorchRL calls this before a reset, as it calls ``inv`` before a step."""
+    def before_reset(self) -> None:
+        """Look around again, if the chain has changed since."""
         self._check_place()
-        return super()._reset_env_preprocess(tensordict)
 
     def _check_place(self) -> None:
-        """Looks around again, if the chain has changed since. To be called before the environment is."""
+        """Look around again, if the chain has changed since. To be called before the environment is."""
         if not self._is_current:
             self._attach()
 
     def _attach(self) -> None:
-        """Checks map against environment, if there is one by now, and reads what holds for all steps."""
+        """Check map against environment, if there is one by now, and read what holds for all steps."""
         self._is_current = True
         env, chain, ahead = surroundings(self)
         if env is None:
@@ -154,7 +153,7 @@ class Attachment(EarlyReader):
     def _attach_context(
         self, base: EnvBase, chain: Compose | None, ahead: list[Transform], made: set[NestedKey]
     ) -> None:
-        """Finds out who has to read the context, and when; ``made`` are the keys that other transforms make."""
+        """Find out who has to read the context, and when; ``made`` are the keys that other transforms make."""
         observation_spec = base.full_observation_spec
         if made and ahead:
             check_writers(ahead, self.context_keys, made)

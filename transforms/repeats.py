@@ -37,7 +37,7 @@ class Repeats:
         return action
 
     def remember(self, tensordict: TensorDictBase, executed: Tensor) -> None:
-        """Notes what was executed, in the input of the step."""
+        """Note what was executed, in the input of the step."""
         if self.possible:
             tensordict.set(self.executed_key, executed)
 

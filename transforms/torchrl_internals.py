@@ -22,8 +22,16 @@ class EarlyReader(Transform):
     reads_early = False
 
     def read_raw(self, observed: TensorDictBase) -> None:
-        """Reads what the environment returned, and may add entries to it."""
+        """Read what the environment returned; entries may be added to it."""
         raise NotImplementedError
+
+    def before_reset(self) -> None:
+        """Called before the environment is reset; by default nothing."""
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Relies on ``TransformedEnv`` calling this before a reset, as it calls ``inv`` before a step."""
+        self.before_reset()
+        return super()._reset_env_preprocess(tensordict)
 
 
 def containers(transform: Transform) -> Iterator[Compose | EnvBase]:
@@ -70,7 +78,7 @@ def leaves(transform: Transform) -> list[Transform]:
 
 
 def let_read_early(chain: Compose, also: Sequence[EarlyReader] = ()) -> None:
-    """Has a chain call its early readers with what the environment returned, before it runs any transform.
+    """Have a chain call its early readers with what the environment returned, before it runs any transform.
 
     The order, the indices and the names of the chain's transforms stay as they are, and so does what they do. What a
     transform takes for its ``parent``, and steps again, reads as early.

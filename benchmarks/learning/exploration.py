@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 import nht
 from nht.envs import make_task
 from nht.recipes.data.recording import record_expert
-from nht.recipes.maps.kinds import make_map
+from nht.recipes.maps.kinds import make_map, task_context_keys
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 
 ACTION_DIMS = {"wam_grasp": 3, "wam_wipe": 2}
@@ -56,11 +56,11 @@ def fitted_maps(env: EnvConfig) -> dict[str, nht.ActionMap]:
     """NHT and SVD trained on the expert's demonstrations, and raw actuation."""
     with tempfile.TemporaryDirectory() as scratch:
         demos = record_expert(env, DemosConfig(transitions=40_000), seed=0, path=Path(scratch) / "demos")
-        width = demos.context(env.context_keys).shape[-1]
+        width = demos.context(task_context_keys(env)).shape[-1]
         maps = {}
         for kind in ("nht", "svd"):
             map = make_map(MapConfig(kind=kind, action_dim=ACTION_DIMS[env.name]), width, 7, seed=0)
-            maps[kind] = nht.train_map(demos, map, context_keys=env.context_keys, max_steps=6_000).map
+            maps[kind] = nht.train_map(demos, map, context_keys=task_context_keys(env), max_steps=6_000).map
     return maps | {"none": make_map(MapConfig(kind="none"), width, 7, seed=0)}
 
 
@@ -74,7 +74,9 @@ def explore(env: EnvConfig, map: nht.ActionMap, scale: float, memory: float) -> 
     steps = at_goal = 0
     for _ in range(task.max_episode_steps):
         observation = task.observe()
-        context = torch.cat([torch.from_numpy(observation[key]) for key in env.context_keys], dim=-1).float()
+        context = torch.cat(
+            [torch.from_numpy(observation[key]) for key in task_context_keys(env)], dim=-1
+        ).float()
         action = torch.from_numpy(noise.clip(-1.0, 1.0)).float()
         outcome = task.step(map(scale * action, context).numpy())
         steps, at_goal = steps + running.sum(), at_goal + (running & outcome.success).sum()

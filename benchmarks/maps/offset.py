@@ -21,9 +21,10 @@ import torch
 from omegaconf import OmegaConf
 
 import nht
-from nht.recipes.config import DemosConfig, EnvConfig
-from nht.recipes.recording import record_expert
-from nht.train import split_episodes
+from nht.recipes.data.recording import record_expert
+from nht.recipes.maps.kinds import task_context_keys
+from nht.recipes.sections import DemosConfig, EnvConfig
+from nht.training_data import split_episodes
 
 LEAD = 0.2  # [s]
 KINDS = ("svd", "scl", "nht")
@@ -70,14 +71,14 @@ def demonstrations() -> tuple[nht.Demos, torch.Tensor, list[str]]:
     env = EnvConfig(**OmegaConf.to_container(OmegaConf.load(HERE.parent / "configs/env/wam_wipe.yaml")))
     with tempfile.TemporaryDirectory() as scratch:
         recorded = record_expert(env, DemosConfig(transitions=20_000), seed=0, path=Path(scratch) / "demos")
-        context = {key: recorded.data[key].clone() for key in env.context_keys}
+        context = {key: recorded.data[key].clone() for key in task_context_keys(env)}
         motion = LEAD * recorded.actuation.clone()
         target = recorded.data["joint_angle"].to(motion) + motion
         episode = recorded.episode.clone()
     return (
         nht.Demos.from_tensors(actuation=target, episode=episode, context=context),
         motion,
-        env.context_keys,
+        task_context_keys(env),
     )
 
 

@@ -19,8 +19,9 @@ import torch
 from omegaconf import OmegaConf
 
 import nht
-from nht.recipes.config import DemosConfig, EnvConfig
-from nht.recipes.recording import record_expert
+from nht.recipes.data.recording import record_expert
+from nht.recipes.maps.kinds import task_context_keys
+from nht.recipes.sections import DemosConfig, EnvConfig
 
 ACTION_DIMS = {"wam_wipe": 2, "wam_grasp": 3, "half_cheetah": 2}
 LIMITS = (None, 1.0, 0.3, 0.1)  # on the whole map
@@ -54,8 +55,10 @@ def main() -> None:
 def demonstrations(task: str, scratch: Path) -> tuple[nht.Demos, list[str]]:
     env = EnvConfig(**OmegaConf.to_container(OmegaConf.load(HERE.parent / f"configs/env/{task}.yaml")))
     if task == "half_cheetah":
-        return nht.load_demos(HERE / "demos" / task), env.context_keys
-    return record_expert(env, DemosConfig(transitions=20_000), seed=0, path=scratch / task), env.context_keys
+        return nht.load_demos(HERE / "demos" / task), task_context_keys(env)
+    return record_expert(
+        env, DemosConfig(transitions=20_000), seed=0, path=scratch / task
+    ), task_context_keys(env)
 
 
 def fit(

@@ -34,7 +34,7 @@ from taking_turns import Method, Row, measure, provenance, quotients, show, tent
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, GymEnv, SerialEnv
 
-from nht.envs import GYMNASIUM_IDS, TASKS, BatchedTask, make_env, make_task
+from nht.envs import TASKS, BatchedTask, gymnasium_id, make_env, make_task
 
 ORIGINALS = {
     "ant": "Ant-v5",
@@ -116,7 +116,7 @@ def torchrl(name: str, env: EnvBase, copies: int) -> Iterator[None]:
 
 def sync_vector(name: str, copies: int) -> Iterator[None]:
     actions = random_actuations(make_task(name, num_envs=copies, seed=0), 256).astype(np.float32)
-    make = partial(gymnasium.make, gymnasium_id(name), disable_env_checker=True)
+    make = partial(gymnasium.make, original_id(name), disable_env_checker=True)
     env = gymnasium.vector.SyncVectorEnv([make] * copies)
     env.reset(seed=0)
     while True:
@@ -125,8 +125,8 @@ def sync_vector(name: str, copies: int) -> Iterator[None]:
             yield
 
 
-def gymnasium_id(name: str) -> str:
-    return ORIGINALS.get(name, GYMNASIUM_IDS[name])
+def original_id(name: str) -> str:
+    return ORIGINALS.get(name, gymnasium_id(name))
 
 
 def make_methods(name: str, envpool: str | None) -> list[Method]:
@@ -135,7 +135,7 @@ def make_methods(name: str, envpool: str | None) -> list[Method]:
     methods += [
         Method("TorchRL", *size, torchrl(name, make_env(name, *size, seed=0), size[0])) for size in sizes
     ]
-    serial = SerialEnv(8, partial(GymEnv, gymnasium_id(name)))
+    serial = SerialEnv(8, partial(GymEnv, original_id(name)))
     methods.append(Method("SyncVectorEnv", 8, 1, sync_vector(name, 8)))
     methods.append(Method("SerialEnv", 8, 1, torchrl(name, serial, 8)))
     if envpool and name == "half_cheetah":

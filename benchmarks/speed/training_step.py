@@ -26,11 +26,12 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import nht
 from nht.recipes.agents.ddpg import PaperDDPGLoss, networks
-from nht.recipes.agents.off_policy import JointSoftUpdate, exploring
+from nht.recipes.agents.off_policy import JointSoftUpdate, exploring, storable
 from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.config import DDPG
-from nht.recipes.ddpg import STORED, main
+from nht.recipes.ddpg import main
 from nht.recipes.launch import configure
+from nht.recipes.maps.kinds import task_context_keys
 from nht.recipes.run.environments import mapped_env
 
 ROUNDS = 4
@@ -59,7 +60,7 @@ def parts(config: DDPG, map: nht.ActionMap) -> dict[str, Callable[[], object]]:
     collected = next(batches).clone()
 
     def store() -> None:
-        buffer.extend(look_ahead(collected).reshape(-1).select(*STORED))
+        buffer.extend(storable(look_ahead(collected)))
 
     store()
     batch = buffer.sample()
@@ -117,7 +118,7 @@ def benchmark() -> None:
     torch.set_num_threads(1)
     config = configure(DDPG, "ddpg")
     map = nht.NHT(10, 7, 2)
-    map.context_keys = tuple(config.env.context_keys)
+    map.context_keys = tuple(task_context_keys(config.env))
     updates = config.algo.updates_per_batch
     with tempfile.TemporaryDirectory() as scratch:
         map_file = nht.save_map(map, Path(scratch) / "map.safetensors")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -15,8 +16,9 @@ from torchrl.objectives import DDPGLoss
 
 from nht.recipes.agents.critics import critic_network
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig
+from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig, mean_over
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
+from nht.recipes.agents.settings import Setting, beside
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import Training
 
@@ -24,6 +26,16 @@ from nht.recipes.sections import Training
 @dataclass
 class DDPGConfig(OffPolicyConfig):
     """DDPG's settings; those of the paper are ``algo=ddpg_paper``."""
+
+    varies: ClassVar[tuple[str, ...]] = (
+        *OffPolicyConfig.varies,
+        "actor_learning_rate",
+        "critic_learning_rate",
+        "action_l2",
+        "exploration_noise",
+        "noise_memory",
+        "random_action",
+    )
 
     frames_per_batch: int = 200
     updates_per_batch: int = 20
@@ -80,6 +92,9 @@ class PaperDDPGLoss(DDPGLoss):
     Parameters, targets and their updaters are TorchRL's. The networks are called as they are, where TorchRL puts
     parameters into one module before every call: that costs a third of an update of networks as small as ours.
 
+    Of several learners, whose networks are ``stacked``, minibatches are ``(L, B)`` and losses ``(L,)``: what follows
+    says ``(B,)`` and a scalar for both.
+
     Args:
         actor_network: ``"features"`` to an ``"action"`` in [-1, 1]^k.
         value_network: features and action to a ``"state_action_value"``.
@@ -94,8 +109,8 @@ class PaperDDPGLoss(DDPGLoss):
         actor_network: TensorDictModule,
         value_network: TensorDictModule,
         *,
-        gamma: float,
-        action_l2: float,
+        gamma: Setting,
+        action_l2: Setting,
         reward_range: Range = UNBOUNDED,
     ) -> None:
         super().__init__(actor_network, value_network, delay_actor=True, delay_value=True)
@@ -114,11 +129,11 @@ class PaperDDPGLoss(DDPGLoss):
         outcome = tensordict["next"]
         with torch.no_grad():
             later = target_critic(outcome["features"], target_actor(outcome["features"]))
-            discount = self.gamma ** tensordict["steps_to_next_obs"].unsqueeze(-1)
+            discount = beside(self.gamma, later) ** tensordict["steps_to_next_obs"].unsqueeze(-1)
             target = outcome["reward"] + discount * ~outcome["terminated"] * later
-            target.clamp_(*self.returns)
+            target.clamp_(*(beside(bound, target) for bound in self.returns))
         error = critic(tensordict["features"], tensordict["action"]) - target
-        return error.square().mean(), {"target_value": target.squeeze(-1)}
+        return mean_over(tensordict, error.square()), {"target_value": target.squeeze(-1)}
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, a scalar; its gradient leaves the critic alone."""
@@ -127,7 +142,7 @@ class PaperDDPGLoss(DDPGLoss):
         critic.requires_grad_(False)
         value = critic(tensordict["features"], action)
         critic.requires_grad_(True)
-        return self.action_l2 * action.square().mean() - value.mean(), {}
+        return self.action_l2 * mean_over(tensordict, action.square()) - mean_over(tensordict, value), {}
 
 
 def policy(env: EnvBase, algo: DDPGConfig) -> TensorDictModule:

@@ -8,6 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from nht.recipes.agents.settings import Setting, beside
+
 Reduction = Callable[[Tensor], Tensor]
 """Adds up a tensor over processes."""
 
@@ -27,6 +29,7 @@ class RunningNorm(nn.Module):
         size: width of the observation.
         clip: largest absolute value put out.
         floor: smallest deviation divided by.
+        learners: that each have statistics of their own; observations are then ``(learners, *batch, size)``.
     """
 
     count: Tensor
@@ -35,14 +38,19 @@ class RunningNorm(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, size: int, clip: float = 5.0, floor: float = 0.01) -> None:
+    def __init__(
+        self, size: int, clip: float = 5.0, floor: float = 0.01, *, learners: int | None = None
+    ) -> None:
         super().__init__()
         self.clip, self.floor = clip, floor
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
-        self.register_buffer("squares", torch.zeros(size, dtype=torch.float64))  # summed squared deviations
-        self.register_buffer("shift", torch.zeros(size))
-        self.register_buffer("scale", torch.ones(size))
+        lead = () if learners is None else (learners,)
+        self.register_buffer("count", torch.zeros(lead, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(*lead, size, dtype=torch.float64))
+        self.register_buffer(
+            "squares", torch.zeros(*lead, size, dtype=torch.float64)
+        )  # of deviations, summed
+        self.register_buffer("shift", torch.zeros(*lead, size))
+        self.register_buffer("scale", torch.ones(*lead, size))
 
     @torch.no_grad()
     def update(self, observation: Tensor, add: Reduction = alone) -> None:
@@ -52,19 +60,26 @@ class RunningNorm(nn.Module):
             observation: of this process.
             add: adds up tensors of all processes that share the statistics, which then stay the same in all of them.
         """
-        rows = observation.reshape(-1, observation.shape[-1]).double() - self.mean
-        count, first, second = add(torch.stack([torch.ones_like(rows), rows, rows.square()]).sum(1))
+        seen = self.count.unsqueeze(-1)
+        rows = observation.reshape(*self.count.shape, -1, observation.shape[-1]).double()
+        rows = rows - self.mean.unsqueeze(-2)
+        count, first, second = add(torch.stack([torch.ones_like(rows), rows, rows.square()]).sum(-2))
         deviation = first / count
-        total = self.count + count
-        self.squares += second - count * deviation**2 + deviation**2 * self.count * count / total
+        total = seen + count
+        self.squares += second - count * deviation**2 + deviation**2 * seen * count / total
         self.mean += deviation * count / total
-        self.count.copy_(total[0])
+        self.count.copy_(total[..., 0])
         self.shift.copy_(self.mean)
         self.scale.copy_((self.squares / total).sqrt().clamp_min(self.floor))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Normalised observations of the same shape."""
-        return ((observation - self.shift) / self.scale).clamp(-self.clip, self.clip)
+        shift, scale = (self.spread(values, observation) for values in (self.shift, self.scale))
+        return ((observation - shift) / scale).clamp(-self.clip, self.clip)
+
+    def spread(self, values: Tensor, observation: Tensor) -> Tensor:
+        """Statistics ``(*learners, size)`` in the shape in which they go with observations."""
+        return values.view(*self.count.shape, *[1] * (observation.ndim - values.ndim), values.shape[-1])
 
 
 class ReturnNorm(nn.Module):
@@ -74,17 +89,20 @@ class ReturnNorm(nn.Module):
         num_envs: number of copies of the environment.
         gamma: discount factor.
         clip: largest absolute reward put out.
+        learners: that each have statistics and ``num_envs`` copies of their own; ``gamma`` may be one for each.
     """
 
     returns: Tensor
 
-    def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:
+    def __init__(
+        self, num_envs: int, gamma: Setting, clip: float = 10.0, *, learners: int | None = None
+    ) -> None:
         super().__init__()
         self.gamma, self.clip = gamma, clip
-        self.statistics = RunningNorm(1, floor=1e-4)
-        self.register_buffer(
-            "returns", torch.zeros(num_envs)
-        )  # of the rewards up to now, of each copy's episode
+        self.statistics = RunningNorm(1, floor=1e-4, learners=learners)
+        lead = () if learners is None else (learners,)
+        # Of the rewards up to now, of each copy's episode.
+        self.register_buffer("returns", torch.zeros(*lead, num_envs))
 
     @torch.no_grad()
     def forward(
@@ -93,16 +111,18 @@ class ReturnNorm(nn.Module):
         """Take rewards into the statistics, then normalise them in place.
 
         Args:
-            data: steps ``(len(copies), steps)``.
+            data: steps ``(*learners, len(copies), steps)``.
             copies: those that made these steps, of the ``num_envs``.
             add: adds up tensors of all processes that share the statistics.
         """
         outcome = data["next"]
         reward, going_on = outcome["reward"].squeeze(-1), ~outcome["done"].squeeze(-1)
-        returns, last = torch.empty_like(reward), self.returns[copies]
+        returns, last = torch.empty_like(reward), self.returns[..., copies]
+        gamma = beside(self.gamma, last)
         for step in range(reward.shape[-1]):
-            returns[:, step] = self.gamma * last + reward[:, step]
-            torch.mul(returns[:, step], going_on[:, step], out=last)
+            returns[..., step] = gamma * last + reward[..., step]
+            torch.mul(returns[..., step], going_on[..., step], out=last)
         self.statistics.update(returns.unsqueeze(-1), add)
-        outcome["reward"] = (outcome["reward"] / self.statistics.scale).clamp(-self.clip, self.clip)
+        scale = self.statistics.spread(self.statistics.scale, outcome["reward"])
+        outcome["reward"] = (outcome["reward"] / scale).clamp(-self.clip, self.clip)
         return data

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -17,6 +16,8 @@ from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
+from nht.recipes.agents.settings import Setting, beside, largest
+from nht.recipes.run.draws import Draws
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import AlgoConfig
 from nht.recipes.torch_internals import lerp_all
@@ -37,6 +38,8 @@ STORED = (
 @dataclass
 class OffPolicyConfig(AlgoConfig):
     """Settings of algorithms with a replay buffer; the defaults are published practice for locomotion."""
+
+    varies: ClassVar[tuple[str, ...]] = ("batch_size", "gamma", "polyak", "pessimism")
 
     frames_per_batch: int = 100
     updates_per_batch: int = 100  # gradient steps after each batch of environment steps
@@ -84,7 +87,12 @@ def replay_buffer(size: int, device: torch.device) -> TensorDictReplayBuffer:
 
 
 def storable(steps: TensorDictBase) -> TensorDictBase:
-    """What the buffer keeps of collected steps ``(*batch,)``, flat; without those whose action is not finite."""
+    """What the buffer keeps of collected steps ``(copies, T)``: rows, without those whose action is not finite.
+
+    Of several learners, ``(L, copies, T)``, a row is a step of each, ``(rows, L)``: one that diverged keeps its own.
+    """
+    if steps.ndim == 3:
+        return steps.select(*STORED).flatten(1, 2).transpose(0, 1)
     flat = steps.reshape(-1)
     return flat[flat["action"].isfinite().all(-1)].select(*STORED)
 
@@ -92,29 +100,69 @@ def storable(steps: TensorDictBase) -> TensorDictBase:
 def minibatches(
     buffer: TensorDictReplayBuffer,
     updates: int,
-    batch_size: int,
+    batch_size: int | Sequence[int],
     features: TensorDictModule,
     device: torch.device,
+    draws: Draws | None = None,
 ) -> Iterator[TensorDictBase]:
     """``updates`` minibatches ``(batch_size,)``, drawn at once and normalised by today's statistics.
 
     Args:
         buffer: of raw observations.
         updates: number of minibatches.
-        batch_size: steps in each.
+        batch_size: steps in each; of several learners, each one's own.
         features: ``"observation"`` to ``"features"``.
         device: where the networks are.
+        draws: of several learners: minibatches are ``(L, B)`` then. Those of fewer steps are filled up to the largest,
+            and a ``"weight"`` says what a step counts for.
     """
     if not updates:
         return
+    if draws is not None:
+        assert not isinstance(batch_size, int)
+        yield from _minibatches_of_each(buffer, updates, batch_size, features, device, draws)
+        return
+    assert isinstance(batch_size, int)
     replay = buffer.sample(updates * batch_size).to(device)
     with torch.no_grad():
         features(replay), features(replay["next"])
     yield from replay.split(batch_size)
 
 
+def _minibatches_of_each(
+    buffer: TensorDictReplayBuffer,
+    updates: int,
+    sizes: Sequence[int],
+    features: TensorDictModule,
+    device: torch.device,
+    draws: Draws,
+) -> Iterator[TensorDictBase]:
+    learners, width = len(sizes), max(sizes)
+    rows = buffer.storage[: len(buffer)].reshape(-1)  # of all learners, in turn
+    drawn = draws.integers(len(buffer), [updates * size for size in sizes])
+    places = torch.zeros(updates, learners, width, dtype=torch.long, device=device)
+    for learner, (size, own) in enumerate(zip(sizes, drawn, strict=True)):
+        places[:, learner, :size] = own.view(updates, size) * learners + learner
+    counts = torch.tensor(sizes, device=device).unsqueeze(-1)
+    weight = (torch.arange(width, device=device) < counts) / counts
+    for chosen in places:
+        batch = rows[chosen.flatten()].view(learners, width).to(device)
+        with torch.no_grad():
+            features(batch), features(batch["next"])
+        yield batch if min(sizes) == width else batch.set("weight", weight)
+
+
+def mean_over(batch: TensorDictBase, values: Tensor) -> Tensor:
+    """The mean of ``(B, ...)`` over a minibatch, a scalar; of ``(L, B, ...)``, that of each learner ``(L,)``."""
+    if batch.ndim == 1:
+        return values.mean()
+    of_steps = values.flatten(2).mean(-1)
+    weight = batch.get("weight", None)
+    return of_steps.mean(-1) if weight is None else (of_steps * weight).sum(-1)
+
+
 def descend(losses: Sequence[Tensor], optimiser: torch.optim.Optimizer, ranks: Ranks) -> None:
-    """One gradient step on the sum of ``losses``, scalars: on the minibatches of all ranks as if they were one."""
+    """One gradient step on the sum of ``losses``: on the minibatches of all ranks as if they were one."""
     torch.stack(list(losses)).sum().backward()
     ranks.average_gradients(weight for group in optimiser.param_groups for weight in group["params"])
     optimiser.step()
@@ -124,11 +172,11 @@ def descend(losses: Sequence[Tensor], optimiser: torch.optim.Optimizer, ranks: R
 class Exploration(Protocol):
     """Settings of the noise that an algorithm explores with."""
 
-    exploration_noise: float
+    exploration_noise: Setting
     """Standard deviation; actions lie in [-1, 1]."""
-    noise_memory: float
+    noise_memory: Setting
     """Steps after which the noise has forgotten itself; 1 is white noise."""
-    random_action: float
+    random_action: Setting
     """Probability of a uniform action instead."""
 
 
@@ -139,11 +187,17 @@ def exploring(policy: TensorDictModule, env: EnvBase, algo: Exploration) -> Tens
     ``1 / noise_memory`` a step; with a memory of 1 it is white.
     """
     rate = 1.0 / algo.noise_memory
-    sigma = algo.exploration_noise * math.sqrt(rate * (2.0 - rate))
+    sigma = algo.exploration_noise * (rate * (2.0 - rate)) ** 0.5
+    theta, sigma = (beside(value, env.action_spec.zero()) for value in (rate, sigma))
     noise = OrnsteinUhlenbeckProcessModule(
-        env.action_spec, eps_init=1.0, eps_end=1.0, theta=rate, sigma=sigma, dt=1.0, device=env.device
+        env.action_spec, eps_init=1.0, eps_end=1.0, theta=theta, sigma=sigma, dt=1.0, device=env.device
     )
-    uniform = EGreedyModule(env.action_spec, algo.random_action, algo.random_action, device=env.device)
+    random = algo.random_action
+    if isinstance(random, Tensor):
+        uniform = EGreedyModule(env.action_spec, 1.0, 1.0, device=env.device)
+        uniform.eps = random.view(-1, 1)
+    else:
+        uniform = EGreedyModule(env.action_spec, random, random, device=env.device)
     return TensorDictSequential(policy, noise, uniform)
 
 
@@ -165,15 +219,21 @@ class JointSoftUpdate(SoftUpdate):
 
     Args:
         loss: with target networks.
-        eps: share of the target networks' parameters that stays; the rest comes from the networks.
+        eps: share of the target networks' parameters that stays; the rest comes from the networks. Learners of a
+            population may have one each.
     """
 
-    def __init__(self, loss: LossModule, *, eps: float) -> None:
-        super().__init__(loss, eps=eps)
+    def __init__(self, loss: LossModule, *, eps: Setting) -> None:
+        super().__init__(loss, eps=largest(eps))
         pairs = list(followed_pairs(self))
         self._learned = [source.data for source, _ in pairs]
         self._followers = [target.data for _, target in pairs]
+        self._way = 1.0 - eps
 
     def step(self) -> None:
         """Move the target networks."""
-        lerp_all(self._followers, self._learned, 1.0 - self.eps)
+        if not isinstance(self._way, Tensor):
+            lerp_all(self._followers, self._learned, self._way)
+            return
+        for follower, learned in zip(self._followers, self._learned, strict=True):
+            follower.lerp_(learned, beside(self._way, learned))

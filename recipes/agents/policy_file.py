@@ -10,9 +10,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from nht.memmap import raw
+from nht.memmap_files import raw
 from nht.reading import plain_file, shortened, shown
-from nht.scratch import publish, scratch
+from nht.writing import publish, scratch
 
 CHECKSUM = "sha256"
 """In the header. It stands there alone: safetensors writes several entries in an order that changes."""

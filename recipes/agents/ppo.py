@@ -18,6 +18,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from nht.recipes.agents.norm import RunningNorm
+from nht.recipes.agents.settings import Setting, beside, largest
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import AlgoConfig, Training
 
@@ -25,6 +26,17 @@ from nht.recipes.sections import AlgoConfig, Training
 @dataclass
 class PPOConfig(AlgoConfig):
     """PPO's settings; those of OpenAI's ppo2, which the paper ran, are ``algo=ppo_paper``."""
+
+    varies: ClassVar[tuple[str, ...]] = (
+        "initial_std",
+        "learning_rate",
+        "gamma",
+        "lmbda",
+        "clip",
+        "critic_coeff",
+        "entropy_coeff",
+        "max_grad_norm",
+    )
 
     total_frames: int = 1_003_520
     frames_per_batch: int = 2_048  # steps per update, of all copies together
@@ -133,18 +145,27 @@ class GaussianActor(nn.Module):
         deviates = torch.zeros_like(mean)
         if exploration_type() is not ExplorationType.DETERMINISTIC:
             deviates.normal_()
-        sample = mean + deviates * self.log_std.exp()
+        sample = mean + deviates * self._log_std_beside(mean).exp()
         return sample, self._log_density(deviates), sample.clamp(-1.0, 1.0)
 
     def log_prob(self, features: Tensor, sample: Tensor) -> tuple[Tensor, Tensor]:
-        """Log-probability of samples, ``(*batch,)``, and the entropy, a scalar."""
-        deviates = (sample - self.network(features)) * (-self.log_std).exp()
-        entropy = self.log_std.sum() + 0.5 * len(self.log_std) * math.log(2 * math.pi * math.e)
+        """Log-probability of samples, ``(*batch,)``, and the entropy, a scalar; of several learners ``(L,)``."""
+        deviates = (sample - self.network(features)) * (-self._log_std_beside(sample)).exp()
+        entropy = self.log_std.sum(-1) + 0.5 * self.log_std.shape[-1] * math.log(2 * math.pi * math.e)
         return self._log_density(deviates), entropy
 
     def _log_density(self, deviates: Tensor) -> Tensor:
-        constant = 0.5 * len(self.log_std) * math.log(2 * math.pi)
-        return -0.5 * deviates.square().sum(-1) - self.log_std.sum() - constant
+        constant = 0.5 * self.log_std.shape[-1] * math.log(2 * math.pi)
+        return -0.5 * deviates.square().sum(-1) - self._log_std_beside(deviates).sum(-1) - constant
+
+    def _log_std_beside(self, values: Tensor) -> Tensor:
+        """``(k,)``; of several learners ``(L, k)``, in the shape that goes with ``(L, *batch, k)``."""
+        *learners, size = self.log_std.shape
+        return (
+            self.log_std.view(*learners, *[1] * (values.ndim - self.log_std.ndim), size)
+            if learners
+            else self.log_std
+        )
 
 
 class GaussianPPOLoss(ClipPPOLoss):
@@ -152,7 +173,8 @@ class GaussianPPOLoss(ClipPPOLoss):
 
     With networks as small as PPO's, TorchRL's loss spends most of its time on looking up keys, swapping parameters
     and building distributions. This one calls the networks and writes the formulas out. Advantages are normalised
-    within the minibatch.
+    within the minibatch. Of several learners, whose networks are ``stacked``, minibatches are ``(L, B)`` and losses
+    ``(L,)``.
 
     Args:
         actor: its module is a ``GaussianActor``.
@@ -177,19 +199,19 @@ class GaussianPPOLoss(ClipPPOLoss):
         actor: TensorDictModule,
         critic: TensorDictModule,
         *,
-        clip: float,
+        clip: Setting,
         clip_value: bool,
-        critic_coeff: float,
-        entropy_coeff: float,
+        critic_coeff: Setting,
+        entropy_coeff: Setting,
         add: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         super().__init__(
             actor,
             critic,
-            clip_epsilon=clip,
+            clip_epsilon=largest(clip),  # TorchRL has one for all; what counts is kept below
             clip_value=clip_value,
-            critic_coeff=critic_coeff,
-            entropy_coeff=entropy_coeff,
+            critic_coeff=largest(critic_coeff),
+            entropy_coeff=largest(entropy_coeff),
             normalize_advantage=True,
             loss_critic_type="l2",
             functional=False,
@@ -204,19 +226,22 @@ class GaussianPPOLoss(ClipPPOLoss):
         log_prob, entropy = self.actor_network.module.log_prob(features, batch["sample"])
         log_ratio = log_prob - batch["sample_log_prob"]
         ratio = log_ratio.exp()
-        clipped = ratio.clamp(1.0 - self._clip, 1.0 + self._clip)
+        clip = beside(self._clip, ratio)
+        clipped = torch.clamp(ratio, 1.0 - clip, 1.0 + clip)
         advantage = self._normalised(batch["advantage"].squeeze(-1))
-        objective = -torch.minimum(ratio * advantage, clipped * advantage).mean()
+        objective = -torch.minimum(ratio * advantage, clipped * advantage).mean(-1)
         critic = self._critic_weight * self._squared_error(self.critic_network.module(features), batch)
         loss = objective + critic - self._entropy_weight * entropy
         with torch.no_grad():
-            reports = (objective, critic, entropy, (clipped != ratio).float().mean(), -log_ratio.mean())
+            clipped_share = (clipped != ratio).float().mean(-1)
+            reports = (objective, critic, entropy, clipped_share, -log_ratio.mean(-1))
         return TensorDict({"loss": loss} | dict(zip(self.reports, reports, strict=True)))
 
     def _normalised(self, advantage: Tensor) -> Tensor:
         """Advantages ``(B,)`` with mean 0 and deviation 1 over the minibatch, other processes' parts of it included."""
         if self._add is None:
-            return (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
+            mean, deviation = advantage.mean(-1, keepdim=True), advantage.std(-1, keepdim=True)
+            return (advantage - mean) / deviation.clamp_min(1e-6)
         count, total = self._add(torch.stack([torch.ones_like(advantage), advantage]).sum(1))
         advantage = advantage - total / count
         variance = self._add(advantage.square().sum()) / (count - 1)
@@ -226,24 +251,36 @@ class GaussianPPOLoss(ClipPPOLoss):
         target = batch["value_target"]
         error = (value - target).square()
         if self._clips_value:
-            old = batch["state_value"]
-            held = old + (value - old).clamp(-self._clip, self._clip)
+            old, clip = batch["state_value"], beside(self._clip, target)
+            held = old + torch.clamp(value - old, -clip, clip)
             error = torch.maximum(error, (held - target).square())
-        return error.mean()
+        return error.squeeze(-1).mean(-1)
+
+
+def advantage_estimator(gamma: Setting, lmbda: Setting) -> Callable[[TensorDictBase], TensorDictBase]:
+    """TorchRL's ``GAE``, which writes into steps ``(*batch, T)``; with numbers of its own for each learner, if told."""
+    if not isinstance(gamma, Tensor) and not isinstance(lmbda, Tensor):
+        return GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+    numbers = zip(*torch.broadcast_tensors(torch.as_tensor(gamma), torch.as_tensor(lmbda)), strict=True)
+    own = [GAE(gamma=float(one), lmbda=float(other), value_network=None) for one, other in numbers]
+    return lambda data: torch.stack([gae(part) for gae, part in zip(own, data, strict=True)])
 
 
 @torch.no_grad()
 def estimate_advantages(
-    data: TensorDictBase, features: TensorDictModule, critic: TensorDictModule, gae: GAE
+    data: TensorDictBase,
+    features: TensorDictModule,
+    critic: TensorDictModule,
+    gae: Callable[[TensorDictBase], TensorDictBase],
 ) -> None:
-    """Write ``"state_value"``, ``"advantage"`` and ``"value_target"`` into collected steps ``(copies, steps)``.
+    """Write ``"state_value"``, ``"advantage"`` and ``"value_target"`` into steps ``(*learners, copies, T)``.
 
     What follows a step is valued by the observation that it led to: where an episode ran into its time limit, that is
     its own last one, not the first of the next episode. Only ``terminated`` makes it worth nothing.
     """
     features(data["next"])
     critic(data), critic(data["next"])
-    gae(data)
+    data.update(gae(data).select("advantage", "value_target"))
 
 
 def policy(env: EnvBase, algo: PPOConfig) -> TensorDictModule:

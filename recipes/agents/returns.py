@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data.postprocs import MultiStep
 from torchrl.envs import EnvBase, TransformedEnv
+
+from nht.recipes.agents.settings import Setting, beside
 
 Range = tuple[float, float]
 """Smallest and largest value."""
@@ -21,31 +25,38 @@ def reward_range(env: EnvBase) -> Range:
     return found
 
 
-def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> Range:
+def return_range(reward_range: Range, gamma: Setting, steps: float = math.inf) -> tuple[Setting, Setting]:
     """The lowest and the highest discounted return that such rewards can add up to, over no step to ``steps``."""
+    if isinstance(gamma, Tensor):
+        ranges = [return_range(reward_range, each, steps) for each in gamma.tolist()]
+        lows, highs = (torch.tensor(ends, device=gamma.device) for ends in zip(*ranges, strict=True))
+        return lows, highs
     low, high = reward_range
     most = steps if gamma == 1.0 else (1.0 - gamma**steps) / (1.0 - gamma)
     return min(low, 0.0) * most, max(high, 0.0) * most
 
 
 def charge_failure(
-    tensordict: TensorDictBase, gamma: float, reward_range: Range, steps: float = math.inf
+    tensordict: TensorDictBase, gamma: Setting, reward_range: Range, steps: float = math.inf
 ) -> TensorDictBase:
     """Let an episode that failure ended be worth the lowest return, where there is one: failing early never pays."""
-    lowest, _ = return_range(reward_range, gamma, steps)
-    if math.isfinite(lowest):
+    if math.isfinite(reward_range[0]):
+        lowest, _ = return_range(reward_range, gamma, steps)
         outcome = tensordict["next"]
         fatal = outcome["failure"] & outcome["terminated"]
-        outcome["reward"] = torch.where(fatal, lowest, outcome["reward"])
+        outcome["reward"] = torch.where(fatal, beside(lowest, outcome["reward"]), outcome["reward"])
     return tensordict
 
 
-def n_step_returns(gamma: float, steps: int) -> MultiStep:
-    """TorchRL's ``MultiStep``, which turns collected steps ``(copies, T)`` into ones of up to ``steps`` rewards.
+def n_step_returns(gamma: Setting, steps: int) -> Callable[[TensorDictBase], TensorDictBase]:
+    """TorchRL's ``MultiStep``, which turns collected steps ``(*batch, T)`` into ones of up to ``steps`` rewards.
 
     Left as it is, it moves observations ahead but not the flags of their ends, and a target that meets a failure would
     go on to the critic's value of what it led to.
     """
+    if isinstance(gamma, Tensor):  # each learner has its own
+        own = [n_step_returns(each, steps) for each in gamma.tolist()]
+        return lambda data: torch.stack([look(part) for look, part in zip(own, data, strict=True)])
     multi_step = MultiStep(gamma, steps)
     multi_step.done_keys = ()
     return multi_step

@@ -28,9 +28,15 @@ class Algorithm:
     schema: type[Training]
     policy: Callable[[EnvBase, Any], TensorDictModule]
 
-    def train(self, config: Training) -> None:
-        """Run the recipe."""
-        imported(self.main)(config)
+    def train(self, *configs: Training, together: str | None = None) -> None:
+        """Run the recipe.
+
+        Args:
+            configs: of one learner; of several, where the algorithm trains them together.
+            together: folder of what several learners share.
+        """
+        more = {} if together is None else {"together": together}
+        imported(self.main)(*configs, **more)
 
 
 def _adopt(name: str, found: Any) -> Algorithm:

@@ -11,7 +11,8 @@ from tensordict import NestedKey, TensorDictBase
 from nht.episodes import whole_episodes
 from nht.hdf5 import D4RL_CONTEXT, hdf5_episodes
 from nht.memmap import read_tensordict
-from nht.minari import left_out_observations, minari_episodes, open_minari
+from nht.minari import left_out_observations, open_minari
+from nht.minari_episodes import minari_episodes
 from nht.reading import naming
 from nht.recipes.sections import SourceConfig
 

@@ -134,10 +134,11 @@ def load_kind(settings: MapConfig) -> nht.ActionMap:
     return map
 
 
-def run_map(settings: Training, motors: int) -> nht.ActionMap:
+def run_map(settings: Training, motors: int) -> nht.MapTraining:
     """The map that a run is told to use: the given file's, one trained on demonstrations, or the motors themselves.
 
-    Raw actuation of a given scale needs no demonstrations.
+    What its training gave comes with it, nothing if there was none. Raw actuation of a given scale needs no
+    demonstrations.
 
     Args:
         settings: of the run.
@@ -156,7 +157,7 @@ def run_map(settings: Training, motors: int) -> nht.ActionMap:
             raise ValueError(
                 f"the map in {map.file} was trained on the observations {list(own)}, env.context_keys are {list(said)}."
             )
-        return loaded
+        return nht.MapTraining(loaded, {})
     if map.kind == "none" and map.residual is None and default_scale(map) is not None:
-        return _configured(nht.Identity(motors), map)
-    return train_map(map, env, settings.demos, settings.seed).map
+        return nht.MapTraining(_configured(nht.Identity(motors), map), {})
+    return train_map(map, env, settings.demos, settings.seed)

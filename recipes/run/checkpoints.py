@@ -13,8 +13,9 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
 from nht.reading import shortened, shown
-from nht.recipes.run.checkpoint_file import CheckpointFile, size_of, write_checkpoint
-from nht.scratch import check_room, publish, remove_leftovers, scratch
+from nht.recipes.run.checkpoint_file import CheckpointFile
+from nht.recipes.run.checkpoint_writing import size_of, write_checkpoint
+from nht.writing import check_room, publish, remove_leftovers, scratch
 
 NAME = re.compile(r"checkpoint-(\d{1,18})\.torchrl")
 """Of a checkpoint, with the number of steps; other files are passed over."""

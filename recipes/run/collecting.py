@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Protocol, cast
 
@@ -20,8 +21,8 @@ from nht.recipes.torchrl_internals import FirstComeCollector, carrier, count_fra
 class MakeEnv(Protocol):
     """Makes environments whose policy acts in [-1, 1]^k."""
 
-    def __call__(self, *, seed: int) -> TransformedEnv:
-        """Those with random draws from ``seed``."""
+    def __call__(self, *, seed: int | Sequence[int]) -> TransformedEnv:
+        """Those with random draws from ``seed``; from several, those of as many learners."""
 
 
 def make_collector(

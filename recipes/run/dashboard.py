@@ -53,6 +53,7 @@ class Dashboard:
                 job_type=run.wandb_job_type,
                 config=dict(settings),
                 mode=mode,
+                reinit="create_new",  # W&B would go on with a run of this process that was left, or is a caller's
             )
         except (wandb.Error, ValueError) as error:
             raise RuntimeError(
@@ -72,6 +73,10 @@ class Dashboard:
         artifact.add_file(str(map_file))
         self._run.log_artifact(artifact)
         self._run.finish()
+
+    def leave(self) -> None:
+        """Note that the run stopped before its end: a process that goes on to others must not keep it open."""
+        self._run.finish(exit_code=1)
 
 
 def open_dashboard(folder: Path, settings: Mapping[str, Any], run: RunConfig) -> Dashboard | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torchrl.envs import EnvBase, TransformedEnv
@@ -12,6 +13,7 @@ import nht
 from nht.envs import FOREIGN, make_env
 from nht.envs.table import imported
 from nht.recipes.maps.kinds import task_context_keys
+from nht.recipes.maps.side_by_side import MapsSideBySide
 from nht.recipes.run.collecting import MakeEnv, worker_seed
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import EnvConfig, Training
@@ -25,7 +27,7 @@ def mapped_env(
     env: EnvConfig,
     map: nht.ActionMap,
     *,
-    seed: int,
+    seed: int | Sequence[int],
     num_envs: int | None = None,
     device: torch.device | str = "cpu",
 ) -> TransformedEnv:
@@ -34,7 +36,7 @@ def mapped_env(
     Args:
         env: which task.
         map: from action and context to actuation; it says what an action means.
-        seed: of the task's random draws.
+        seed: of the task's random draws; several make an environment of batch size ``[seeds, copies]``.
         num_envs: number of copies, if another than the configuration's.
         device: where the tensors go.
 
@@ -47,7 +49,11 @@ def mapped_env(
 
 
 def base_env(
-    env: EnvConfig, *, seed: int, num_envs: int | None = None, device: torch.device | str = "cpu"
+    env: EnvConfig,
+    *,
+    seed: int | Sequence[int],
+    num_envs: int | None = None,
+    device: torch.device | str = "cpu",
 ) -> EnvBase:
     """The task itself, driven by actuations; arguments as of ``mapped_env``.
 
@@ -76,32 +82,43 @@ def lasting_failures(env: EnvConfig) -> EnvConfig:
 
 
 class RunEnvs:
-    """The environments of one of the processes that learn together.
+    """The environments of one of the processes that learn together, or of several learners in one process.
 
     Args:
-        config: the run's whole configuration.
-        map: the run's action map.
+        configs: the whole configuration of the run; of several learners, of each.
+        maps: their action maps.
         ranks: the processes among which copies are divided.
 
     Raises:
-        ValueError: if the copies cannot be divided among processes and workers.
+        ValueError: if the copies cannot be divided among processes and workers, or maps do not go together.
 
     Attributes:
-        copies: how many copies of the task are this process's.
+        learners: how many there are, or None for one alone: the environments' batch size is ``[learners, copies]``.
+        copies: how many copies of the task are this process's, for each learner.
         train: the task to train on; of parallel collectors, the copies of one worker.
         test: the same with one copy for each test episode, on seeds of its own; failures last.
         seed: of this process's random draws.
     """
 
-    def __init__(self, config: Training, map: nht.ActionMap, ranks: Ranks) -> None:
-        self._config, self._map, self._device = config, map, ranks.device
+    def __init__(
+        self,
+        configs: Training | Sequence[Training],
+        maps: nht.ActionMap | Sequence[nht.ActionMap],
+        ranks: Ranks,
+    ) -> None:
+        configs = [configs] if isinstance(configs, Training) else configs
+        maps = [maps] if isinstance(maps, nht.ActionMap) else maps
+        config = configs[0]
+        self._config, self._device = config, ranks.device
+        self.learners = len(configs) if len(configs) > 1 else None
+        self._map = maps[0] if self.learners is None else MapsSideBySide(maps)
+        self._seeds = [each.seed for each in configs]
         self.copies = ranks.share("env.num_envs", config.env.num_envs or 1)
         self.seed = worker_seed(config.seed, ranks.rank) if ranks.rank else config.seed
         env = lasting_failures(config.env) if config.algo.lasting_failures else config.env
-        self.make: MakeEnv = partial(
-            mapped_env, env, map, num_envs=self._copies_per_worker(ranks), device=self._device
-        )
-        self.train: TransformedEnv = self.make(seed=self.seed)
+        copies = self._copies_per_worker(ranks)
+        self.make: MakeEnv = partial(mapped_env, env, self._map, num_envs=copies, device=self._device)
+        self.train: TransformedEnv = self.make(seed=self.seed if self.learners is None else self._seeds)
         self.test = self.more_tests(config.evaluation.episodes)
 
     def _copies_per_worker(self, ranks: Ranks) -> int:
@@ -113,15 +130,33 @@ class RunEnvs:
             )
         return self.copies // workers
 
+    @cached_property
+    def final_test(self) -> TransformedEnv:
+        """The task to test on at the end, with as many copies as that asks for."""
+        evaluation = self._config.evaluation
+        if evaluation.final_episodes in (None, evaluation.episodes):
+            return self.test
+        return self.more_tests(evaluation.final_episodes)
+
     def more_tests(self, episodes: int) -> TransformedEnv:
-        """The task to test on, with one copy for each episode, from the first test seed on."""
-        seed = self._config.seed + TEST_SEED
-        env = lasting_failures(self._config.env)
-        return mapped_env(env, self._map, seed=seed, num_envs=episodes, device=self._device)
+        """The task to test on, with one copy for each episode (of each learner), from the first test seed on."""
+        seeds = [seed + TEST_SEED for seed in self._seeds]
+        return self._tests(self._config, self._map, seeds[0] if self.learners is None else seeds, episodes)
+
+    def filmed(self, config: Training, map: nht.ActionMap, episodes: int) -> TransformedEnv:
+        """The task that one learner is tested on, with one copy for each episode, from the first test seed on."""
+        return self._tests(config, map, config.seed + TEST_SEED, episodes)
+
+    def _tests(
+        self, config: Training, map: nht.ActionMap, seed: int | list[int], episodes: int
+    ) -> TransformedEnv:
+        env = lasting_failures(config.env)
+        return mapped_env(env, map, seed=seed, num_envs=episodes, device=self._device)
 
     def close(self) -> None:
         """Release the simulators."""
-        for env in (self.train, self.test):
+        final = self.__dict__.get("final_test", self.test)  # unless none was made
+        for env in (self.train, self.test, final):
             if not env.is_closed:
                 env.close()
 

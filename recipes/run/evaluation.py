@@ -17,7 +17,7 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Outcome of a number of test episodes, one value each, ``(episodes,)``."""
+    """Outcome of a number of test episodes, one value each, ``(episodes,)``; of learners, ``(L, episodes)``."""
 
     success: torch.Tensor
     """Whether the episode was successful at its last step."""
@@ -25,6 +25,13 @@ class Evaluation:
     """Whether it ever failed."""
     episode_return: torch.Tensor
     """Sum of its rewards."""
+
+    def each(self) -> list[Evaluation]:
+        """The outcome of every learner."""
+        if self.success.ndim == 1:
+            return [self]
+        parts = zip(self.success, self.failure, self.episode_return, strict=True)
+        return [Evaluation(*part) for part in parts]
 
     def metrics(self) -> dict[str, float]:
         """Means over the episodes."""

@@ -10,44 +10,29 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pandas
-import torch
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 import nht
-from nht.reading import shortened
-from nht.recipes.agents.table import find_algorithm, name_of
+from nht.recipes.agents.table import name_of
 from nht.recipes.maps.interface import run_map
-from nht.recipes.maps.kinds import default_scale, find_kind, map_context_keys
-from nht.recipes.run.config_file import check_code, read_settings
+from nht.recipes.maps.kinds import default_scale, map_context_keys
 from nht.recipes.run.dashboard import Dashboard, open_dashboard, wanted
 from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
 from nht.recipes.run.metrics_file import read_metrics
-from nht.recipes.run.ownership import claimed, owner_of
+from nht.recipes.run.ownership import OwnedError, claimed, owner_of
 from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.same_run import check_same
+from nht.recipes.run.saved_run import CONFIG_FILE, MAP_FILE, kept_map, read_config, read_run
 from nht.recipes.sections import Training
-from nht.storage import format_version, replacing
+from nht.writing import replacing
 
-CONFIG_FILE, METRICS_FILE, WHOLE_FILE = "config.yaml", "metrics.csv", "whole.json"
-MAP_FILE, VIDEO_FILE = "map.safetensors", "video.mp4"
-OLDEST_ALGORITHM = "ddpg"
-"""Of folders whose configuration does not say which algorithm it is for."""
-
-TAKEN = (
-    "algo.total_frames",
-    "evaluation.every",
-    "evaluation.video",
-    "env.num_threads",
-    "device",
-    "torch_threads",
-    "run",
-)
-"""Settings that a run may go on with others of; all else is what its checkpoints were made for."""
+METRICS_FILE, WHOLE_FILE, VIDEO_FILE = "metrics.csv", "whole.json", "video.mp4"
+MAP_METRICS_FILE = "map.json"
+"""What the training of the run's map gave, if it trained one."""
 
 
 class RunFolder:
@@ -101,9 +86,7 @@ class RunFolder:
         lock = self.path / ".owner"
         undo.push(self._open)
         if not self._open.enter_context(claimed(lock)):
-            raise FileExistsError(
-                f"{self.path} is being written by {owner_of(lock)}: wait, or choose another."
-            )
+            raise OwnedError(f"{self.path} is being written by {owner_of(lock)}: wait, or choose another.")
         if [entry.name for entry in self.path.iterdir()] == [lock.name]:  # ours alone to take away again
             undo.callback(shutil.rmtree, self.path, ignore_errors=True)
         self._look()
@@ -117,13 +100,16 @@ class RunFolder:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
         if not (kept := self.path / MAP_FILE).exists():
-            map = run_map(self.config, motors)
+            map, found = run_map(self.config, motors)
             mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
+            if found:
+                with replacing(self.path / MAP_METRICS_FILE) as scratch:
+                    scratch.write_text(json.dumps(found))
             nht.save_map(map, kept)
         self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
 
     def _look(self) -> None:
-        """Finds out whether a run is to go on here, and whether it may."""
+        """Find out whether a run is to go on here, and whether it may."""
         settings, run = self.path / CONFIG_FILE, self.config.run
         resume = run.resume or ("auto" if self._ranks.restarts else False)  # torchrun starts processes anew
         self.resuming = settings.exists()
@@ -136,26 +122,11 @@ class RunFolder:
             raise FileExistsError(refusal)
         if self.resuming:
             try:
-                self._check_same(*_read(settings, self._named()))
+                check_same(self.path, self.config, *read_run(self.path, self._named()))
             except ValueError as error:
                 if resume is False:
                     raise FileExistsError(refusal) from error
                 raise
-
-    def _check_same(self, algorithm: str, saved: Training) -> None:
-        now = name_of(type(self.config))
-        if find_algorithm(algorithm).schema is not type(self.config):
-            raise ValueError(f"{self.path} holds a run of {algorithm}: it cannot go on with {now}.")
-        if self.config.env.context_keys is None:
-            self.config.env.context_keys = saved.env.context_keys
-        if not self.config.map.scale_is_set:
-            self.config.map.action_scale = saved.map.action_scale
-        before, after = _flat(asdict(saved)), _flat(asdict(self.config))
-        changed = [name for name in after if before.get(name) != after[name] and not _is_taken(name)]
-        if changed:
-            old = ", ".join(f"{name}={before.get(name)}" for name in changed)
-            new = ", ".join(f"{name}={after[name]}" for name in changed)
-            raise ValueError(f"{self.path} holds a run with {old}: it cannot go on with {new}.")
 
     def _settings(self) -> dict[str, Any]:
         """What ``config.yaml`` holds."""
@@ -173,6 +144,36 @@ class RunFolder:
             return bool(ended[FRAMES] >= self.config.algo.total_frames)
         except (OSError, ValueError, KeyError, TypeError):
             return False
+
+    @property
+    def members(self) -> list[RunFolder]:
+        """The folders of all learners: this one."""
+        return [self]
+
+    @property
+    def configs(self) -> list[Training]:
+        """The configurations of all learners."""
+        return [self.config]
+
+    @property
+    def maps(self) -> list[nht.ActionMap]:
+        """The action maps of all learners."""
+        return [self.map]
+
+    def finished(self) -> list[tuple[int, RunFolder]]:
+        """The learners that got to the end, with their numbers."""
+        return [(0, self)]
+
+    def log_each(self, frames: int, rows: Sequence[dict[str, float] | FloatingPointError]) -> None:
+        """Append the row of the only learner.
+
+        Raises:
+            FloatingPointError: if that is what there is in its place.
+        """
+        (row,) = rows
+        if isinstance(row, FloatingPointError):
+            raise row
+        self.log(frames, row)
 
     def log(self, frames: int, row: dict[str, float]) -> None:
         """Append a row to ``metrics.csv`` and send it to W&B, against environment steps."""
@@ -205,14 +206,14 @@ class RunFolder:
             csv.writer(file).writerows([heading, *kept])
 
     def finish(self, frames: int) -> None:
-        """Hand video and map to W&B, note that the run is whole, and show it."""
+        """Hand video and map to W&B, and note that the run is whole."""
         if not self._ranks.first:
             return
         if self._dashboard is not None:
             self._dashboard.finish(self.path / MAP_FILE, self.path / VIDEO_FILE)
+            self._dashboard = None
         with replacing(self.path / WHOLE_FILE) as scratch:
             scratch.write_text(json.dumps({FRAMES: frames}))
-        self.show()
 
     def show(self) -> None:
         """Say what happened and where the files are."""
@@ -224,7 +225,10 @@ class RunFolder:
         print(f"\n{self.path}: " + ", ".join(shown))
 
     def close(self) -> None:
-        """Let go of the folder."""
+        """Let go of the folder, and of W&B's run if it did not get to its end."""
+        if self._dashboard is not None:
+            self._dashboard.leave()
+            self._dashboard = None
         self._open.close()
 
 
@@ -235,69 +239,3 @@ def resolved(config: Training) -> Training:
     if config.map.file is not None:  # the file says
         env, map = replace(config.env), replace(config.map)
     return replace(config, env=env, map=map)
-
-
-def read_config(folder: Path, allow: Sequence[str] = ()) -> Training:
-    """The configuration that a run was started with.
-
-    Args:
-        folder: of the run.
-        allow: packages whose code it may name by import paths.
-
-    Raises:
-        FileNotFoundError: if the folder holds no run.
-        ValueError: if its configuration cannot be read, or names code of other packages.
-    """
-    if not (folder / CONFIG_FILE).exists():
-        raise FileNotFoundError(f"{folder} holds no run: it has no {CONFIG_FILE}.")
-    return _read(folder / CONFIG_FILE, allow)[1]
-
-
-def _read(settings: Path, allow: Sequence[str] = ()) -> tuple[str, Training]:
-    """The name of the algorithm, and the configuration."""
-    saved = read_settings(settings)
-    check_code(saved, settings, allow)
-    algorithm = saved.pop("recipe", OLDEST_ALGORITHM)
-    try:
-        schema = OmegaConf.structured(find_algorithm(algorithm).schema)
-        return algorithm, cast(Training, OmegaConf.to_object(OmegaConf.merge(schema, saved)))
-    except (OmegaConfBaseException, ValueError, TypeError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"{settings} is no configuration of a run: {shortened(error)}.") from error
-
-
-def kept_map(
-    folder: Path, config: Training, device: torch.device | str = "cpu", allow: Sequence[str] = ()
-) -> nht.ActionMap:
-    """The action map of a run; of one that an earlier version made, with the scale that its configuration has.
-
-    Args:
-        folder: of the run.
-        config: of the run.
-        device: where the map goes.
-        allow: packages whose classes the map's file may name, beside that of the kind of map.
-
-    Raises:
-        FileNotFoundError, ValueError: as ``nht.load_map``.
-    """
-    path = folder / MAP_FILE
-    own = find_kind(config.map.kind).map_class.__module__  # the configuration names it
-    map = nht.load_map(path, device=device, allow=[*allow, own])
-    scale = config.map.action_scale
-    if format_version(path) == 1 and config.map.scale_is_set and scale is not None:
-        map.action_scale.fill_(scale)
-    return map
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted names; free dictionaries, such as options, stay whole."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        if isinstance(value, dict) and not prefix:
-            flat |= _flat(value, f"{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
-
-
-def _is_taken(name: str) -> bool:
-    return any(name == taken or name.startswith(f"{taken}.") for taken in TAKEN)

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -16,11 +16,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 
-from nht.recipes.agents.policy import save_policy
+from nht.recipes.agents.policy import load_policy, save_policy
+from nht.recipes.agents.stacking import of_learner
 from nht.recipes.run.checkpoints import Checkpoints
 from nht.recipes.run.collecting import CollectorState, batch_copies, make_collector
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.folder import VIDEO_FILE, RunFolder
+from nht.recipes.run.learners import Learners
+from nht.recipes.run.population import PopulationFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
 from nht.recipes.run.video import record_video
@@ -44,6 +47,7 @@ class Loop:
         record: of the run.
         policy: what acts, exploration included.
         loss: whose parameters are trained; all processes start with the first one's.
+        learners: whose folders, environments and networks these are, if they may be several.
         random_frames: the first steps of all processes, whose actions are uniform.
         parts: what else the algorithm goes on from, each with a ``state_dict`` and a ``load_state_dict``.
 
@@ -53,36 +57,42 @@ class Loop:
 
     def __init__(
         self,
-        folder: RunFolder,
+        folder: RunFolder | PopulationFolder,
         ranks: Ranks,
         envs: RunEnvs,
         record: Record,
         policy: TensorDictModuleBase,
         loss: nn.Module,
         *,
+        learners: Learners[Any] | None = None,
         random_frames: int = 0,
         **parts: Any,
     ) -> None:
         config = folder.config
+        self._learners = learners
+        many = (learners.count if learners is not None else None) or 1
         self._folder, self._ranks, self._envs, self._record = folder, ranks, envs, record
         self._policy, self._loss = policy, loss
         self._every = config.run.checkpoint_every
         self._signal: int | None = None
         self._told_at = 0.0  # by the clock that never goes back [s]
         ranks.part_ways(envs.seed)  # the networks are made, alike in all processes; exploration differs
-        self.collector: BaseCollector = make_collector(
-            config.collector,
-            envs.train,
-            envs.make,
-            policy,
-            frames_per_batch=ranks.share("algo.frames_per_batch", config.algo.frames_per_batch),
-            seed=envs.seed,
-            random_frames=random_frames // ranks.size,
-        )
+        with self._exploring():  # a collector tries the policy
+            self.collector: BaseCollector = make_collector(
+                config.collector,
+                envs.train,
+                envs.make,
+                policy,
+                frames_per_batch=many * ranks.share("algo.frames_per_batch", config.algo.frames_per_batch),
+                seed=envs.seed,
+                random_frames=many * random_frames // ranks.size,
+            )
         self._alone = isinstance(self.collector, Collector)
         simulation = envs.train.base_env.task
         if self._alone:
             parts["simulator"] = simulation
+        if learners is not None and learners.draws is not None:
+            parts["draws"] = learners.draws
         if ranks.first and not simulation.can_resume:
             print(
                 f"{folder.path.name}: {simulation.resume_obstacle}. A run that is stopped goes on with new episodes."
@@ -158,7 +168,9 @@ class Loop:
         if self._alone:
             batches = iter(self.collector)
             while not self._record.finished:
-                yield next(batches)
+                with self._exploring():
+                    batch = next(batches)
+                yield batch
                 self._save_if_due()
             return
         workers = Workers(self.collector, self._ranks.device)
@@ -169,6 +181,10 @@ class Loop:
             with self._saving():
                 workers.update(self._policy)
             self._save_if_due()
+
+    def _exploring(self) -> AbstractContextManager[Any]:
+        """Within, every learner draws from its own generator."""
+        return nullcontext() if self._learners is None else self._learners.exploring()
 
     @contextmanager
     def _saving(self) -> Iterator[None]:
@@ -196,18 +212,24 @@ class Loop:
         return batch_copies(self.collector, self._envs.train.batch_size.numel())
 
     def finish(self, policy: TensorDictModuleBase) -> None:
-        """Save and film the policy, close everything, and say what happened."""
-        folder, config = self._folder, self._folder.config
-        if self._ranks.first:
-            save_policy(policy, folder.path)
-            if config.evaluation.video:
-                self._film(policy)
-        folder.finish(self._record.frames)
+        """Save and film the policy of every learner, close everything, and say what happened."""
+        folder = self._folder
+        for learner, member in folder.finished():
+            if self._ranks.first:
+                state = policy.state_dict()
+                many = len(folder.members) > 1
+                save_policy(of_learner(state, learner) if many else state, member.path)
+                if member.config.evaluation.video:
+                    self._film(member, policy)
+            member.finish(self._record.frames)
+        folder.show()
         folder.close()
         self._ranks.part()
 
-    def _film(self, policy: TensorDictModuleBase) -> None:
+    def _film(self, member: RunFolder, policy: TensorDictModuleBase) -> None:
+        env = self._envs.filmed(member.config, member.map, VIDEO_EPISODES)
+        shown = policy if len(self._folder.members) == 1 else load_policy(member.path, env, member.config)
         try:
-            record_video(self._envs.more_tests(VIDEO_EPISODES), policy, self._folder.path / VIDEO_FILE)
+            record_video(env, shown, member.path / VIDEO_FILE)
         except RuntimeError as error:  # a machine without OpenGL trains all the same
             print(f"no video: {error}")

@@ -16,6 +16,10 @@ from pathlib import Path
 from typing import IO
 
 
+class OwnedError(FileExistsError):
+    """Another process owns what this one was to write."""
+
+
 @contextlib.contextmanager
 def claimed(file: Path) -> Iterator[bool]:
     """Whether this process owns what ``file`` stands for: nobody else does, here or where the folder is shared.

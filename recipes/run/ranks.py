@@ -100,6 +100,8 @@ class Ranks:
         Raises:
             ValueError: if it cannot be divided.
         """
+        if self.size == 1:
+            return number
         if number % self.size:
             raise ValueError(
                 f"{name}={number} must be a multiple of the {self.size} processes that share it."

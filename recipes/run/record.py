@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import pandas
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.evaluation import Evaluation
+from nht.recipes.run.evaluation import Policy, evaluate
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.metrics import RETURN, SUCCESS, UPDATES, tested
+from nht.recipes.run.population import PopulationFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.statistics import Counters, TrainingStatistics
 
@@ -27,14 +29,17 @@ class Record:
         losses: what an update reports, by name; each becomes a column of ``metrics.csv``.
 
     Attributes:
-        counters: environment steps and gradient steps so far, the steps of all processes.
+        counters: environment steps and gradient steps so far, the steps of all processes; of each of several learners.
         statistics: sums since the last row.
     """
 
-    def __init__(self, folder: RunFolder, ranks: Ranks, envs: RunEnvs, losses: Sequence[str]) -> None:
-        self._folder, self._ranks = folder, ranks
+    def __init__(
+        self, folder: RunFolder | PopulationFolder, ranks: Ranks, envs: RunEnvs, losses: Sequence[str]
+    ) -> None:
+        self._folder, self._ranks, self._envs = folder, ranks, envs
         self.counters = Counters()
-        self.statistics = TrainingStatistics(envs.train.base_env.action_spec.space, losses)
+        bounds = envs.train.base_env.action_spec.space
+        self.statistics = TrainingStatistics(bounds, losses, envs.learners)
         self._total, self._every = folder.config.algo.total_frames, folder.config.evaluation.every
         self._bar: tqdm[Any] | None = None
 
@@ -65,10 +70,11 @@ class Record:
         )
 
     def count_steps(self, data: TensorDictBase) -> None:
-        """Take collected steps ``(*batch,)`` into counters and statistics."""
-        steps = data.numel() * self._ranks.size
+        """Take collected steps ``(copies, T)``, or ``(learners, copies, T)``, into counters and statistics."""
+        learners = self._envs.learners
+        steps = data.numel() // (learners or 1) * self._ranks.size
         self.counters.frames += steps
-        self.statistics.add_steps(data.reshape(-1))
+        self.statistics.add_steps(data.reshape(-1) if learners is None else data.flatten(1, 2))
         if self._bar is not None:
             self._bar.update(steps)
 
@@ -77,14 +83,26 @@ class Record:
         self.counters.updates += 1
         self.statistics.add_losses(losses)
 
-    def log(self, outcome: Evaluation) -> None:
-        """Write a row of metrics: the training of all processes since the last one, and an evaluation."""
-        row = self.statistics.take(self._ranks.sum) | outcome.metrics() | {UPDATES: self.counters.updates}
-        self._folder.log(self.counters.frames, row)
-        shown = {RETURN: row[tested(RETURN)]}
-        if row[tested(SUCCESS)] > 0:  # never, where a task has no notion of success
-            shown[SUCCESS] = row[tested(SUCCESS)]
+    def evaluate(self, policy: Policy) -> None:
+        """Test the policy, and write a row of metrics: the training of all processes since the last one, and the test.
+
+        Raises:
+            FloatingPointError: if training has diverged, that of all learners.
+        """
+        outcomes = evaluate(self._envs.final_test if self.finished else self._envs.test, policy).each()
+        trained = self.statistics.take_each(self._ranks.sum)
+        rows = [
+            found
+            if isinstance(found, FloatingPointError)
+            else found | outcome.metrics() | {UPDATES: self.counters.updates}
+            for found, outcome in zip(trained, outcomes, strict=True)
+        ]
+        self._folder.log_each(self.counters.frames, rows)
         if self._bar is not None:
+            means = pandas.DataFrame([row for row in rows if isinstance(row, dict)]).mean()
+            shown = {RETURN: means[tested(RETURN)]}
+            if means[tested(SUCCESS)] > 0:  # never, where a task has no notion of success
+                shown[SUCCESS] = means[tested(SUCCESS)]
             show_beside(self._bar, **shown)
 
     def close(self) -> None:

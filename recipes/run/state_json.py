@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from nht.reading import entry, shortened
+from nht.recipes.torch_internals import layout_versions, set_layout_versions
 
 DEVICE = re.compile(r"cpu|(cuda|xpu|mps)(:\d{1,3})?")
 
@@ -25,7 +26,7 @@ def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
             return {"kind": "tensor", "key": key, "device": str(value.device)}
         return {"kind": "numpy", "key": key, "dtype": value.dtype.str}
     if isinstance(value, Mapping):
-        about = getattr(value, "_metadata", None)  # torch's modules put the versions of their layouts there
+        about = layout_versions(value)
         items = [[encoded(key, tensors), encoded(item, tensors)] for key, item in value.items()]
         kind = "ordered_dict" if isinstance(value, OrderedDict) else "dict"
         return {"kind": kind, "items": items} | (
@@ -83,7 +84,7 @@ def _mapping(node: dict[str, Any], tensors: Mapping[str, Tensor], where: str) ->
             )
         found[key] = decoded(pair[1], tensors, where)
     if node.get("metadata") is not None and isinstance(found, OrderedDict):
-        found._metadata = decoded(node["metadata"], tensors, where)  # type: ignore[attr-defined]
+        set_layout_versions(found, decoded(node["metadata"], tensors, where))
     return found
 
 

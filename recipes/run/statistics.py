@@ -37,16 +37,21 @@ class TrainingStatistics:
     Args:
         bounds: the actuation's space in the environment, which clips at its ``low`` and ``high``, ``(*batch, n)``.
         losses: names under which an update reports.
+        learners: whose means are kept apart: steps are ``(learners, T)`` and losses ``(learners,)`` then.
     """
 
-    def __init__(self, bounds: ContinuousBox, losses: Sequence[str] = ()) -> None:
+    def __init__(
+        self, bounds: ContinuousBox, losses: Sequence[str] = (), learners: int | None = None
+    ) -> None:
         self._losses = tuple(losses)
         self._low, self._high = (bound.reshape(-1, bound.shape[-1])[0] for bound in (bounds.low, bounds.high))
+        self._learners = learners
         self._clear()
 
     def _clear(self) -> None:
         self._sums: dict[str, torch.Tensor | float] = defaultdict(float)
-        self._updates = self._episodes = self._steps = 0
+        self._updates = self._steps = 0
+        self._episodes: torch.Tensor | int = 0
 
     def add_losses(self, losses: TensorDictBase) -> None:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
@@ -55,19 +60,30 @@ class TrainingStatistics:
             self._sums[name] = self._sums[name] + losses[name].detach().double()
 
     def add_steps(self, steps: TensorDictBase) -> None:
-        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations."""
+        """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations.
+
+        As of losses, the sums stay tensors.
+        """
         outcome = steps["next"]
         done, actuation = outcome["done"], outcome["actuation"]
-        self._steps += len(steps)
-        self._sums[CLIPPED] += float(((actuation <= self._low) | (actuation >= self._high)).any(-1).sum())
-        self._episodes += int(done.sum())
+        self._steps += steps.shape[-1]
+        clipped = ((actuation <= self._low) | (actuation >= self._high)).any(-1, keepdim=True)
+        self._episodes = self._episodes + self._count(done)
+        self._add(CLIPPED, clipped)
         for name in (SUCCESS, FAILURE):
-            self._sums[name] += float((outcome[name] & done).sum())
-        self._sums[DIVERGED] += float(outcome[DIVERGED].sum())
+            self._add(name, outcome[name] & done)
+        self._add(DIVERGED, outcome[DIVERGED])
+
+    def _add(self, name: str, flags: torch.Tensor) -> None:
+        self._sums[name] = self._sums[name] + self._count(flags)
+
+    def _count(self, flags: torch.Tensor) -> torch.Tensor:
+        """How many of ``(T, 1)`` are true; of each learner's, where there are several."""
+        return flags.squeeze(-1).sum(-1).double()
 
     def state_dict(self) -> dict[str, Any]:
         """The sums so far."""
-        counts = {"updates": self._updates, "episodes": self._episodes, "steps": self._steps}
+        counts = {"updates": self._updates, "episodes": int(self._episodes), "steps": self._steps}
         return {
             "counts": counts,
             "sums": {name: torch.as_tensor(total) for name, total in self._sums.items()},
@@ -80,7 +96,7 @@ class TrainingStatistics:
         self._sums = defaultdict(float, saved.get("sums", {}))
 
     def take(self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums) -> dict[str, float]:
-        """The means, starting anew; NaN where nothing was counted.
+        """The means of one learner, starting anew; NaN where nothing was counted.
 
         Args:
             add: adds up the sums of all processes that train together.
@@ -88,16 +104,30 @@ class TrainingStatistics:
         Raises:
             FloatingPointError: if a loss is no longer finite: the networks are lost.
         """
+        (row,) = self.take_each(add)
+        if isinstance(row, FloatingPointError):
+            raise row
+        return row
+
+    def take_each(
+        self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
+    ) -> list[dict[str, float] | FloatingPointError]:
+        """The means of every learner, as ``take`` gives them; the error in the place of one whose networks are lost."""
         names = (SUCCESS, FAILURE, DIVERGED, CLIPPED, *self._losses)
-        counts = (self._updates, self._episodes, self._steps)
-        own = torch.tensor([*counts, *(float(self._sums[name]) for name in names)], dtype=torch.float64)
-        (updates, episodes, steps), values = (part.tolist() for part in add(own).split([3, len(names)]))
-        sums = dict(zip(names, values, strict=True))
+        counted = (self._updates, self._episodes, self._steps, *(self._sums[name] for name in names))
+        own = [torch.as_tensor(value, dtype=torch.float64).cpu() for value in counted]
+        totals = add(torch.stack([value.expand(self._learners or 1) for value in own]))
+        self._clear()
+        return [self._row(dict(zip(names, sums, strict=True)), *counts) for counts, sums in _split(totals)]
+
+    def _row(
+        self, sums: dict[str, float], updates: float, episodes: float, steps: float
+    ) -> dict[str, float] | FloatingPointError:
         for name, value in sums.items():
             if not math.isfinite(value):
-                raise FloatingPointError(f"{name} is {value}: training diverged. Lower the learning rates.")
+                return FloatingPointError(f"{name} is {value}: training diverged. Lower the learning rates.")
         if steps and sums[DIVERGED] >= steps:
-            raise FloatingPointError(
+            return FloatingPointError(
                 f"every one of {steps:.0f} steps diverged: actuations or physics are not finite. Look at the map."
             )
         row = {
@@ -106,5 +136,9 @@ class TrainingStatistics:
             DIVERGED: sums[DIVERGED],  # a count: each one is a failure of map, policy or physics
             CLIPPED: sums[CLIPPED] / (steps or math.nan),  # steps with a motor at its limit
         }
-        self._clear()
         return row | {name: sums[name] / (updates or math.nan) for name in self._losses}
+
+
+def _split(totals: torch.Tensor) -> list[tuple[list[float], list[float]]]:
+    """Of every learner the three counts, and the sums."""
+    return [(column[:3], column[3:]) for column in totals.T.tolist()]

@@ -8,17 +8,22 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 try:
     import ray
-    from ray.exceptions import RayError
+    from ray.exceptions import OutOfMemoryError, RayError, RayTaskError, WorkerCrashedError
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 except ImportError as error:
     raise ImportError("searches need Ray: pip install 'nht[search]'.") from error
 
+from nht.reading import shortened
 from nht.recipes.study.jobs import Ending, Job
+from nht.recipes.study.packs import Pack
+
+Work = TypeVar("Work", Job, Pack)
 
 ANSWER = 15.0
 """Seconds within which a cluster must answer."""
@@ -54,27 +59,46 @@ class Cluster:
             raise
 
     def run(
-        self, work: Callable[[Job, Path], Ending | None], jobs: Sequence[Job], folder: Path
-    ) -> Iterator[Job]:
-        """Do ``work(job, folder)`` for all jobs, one core each, and give each back once it is done.
+        self, work: Callable[[Work, Path], object], tasks: Sequence[Work], folder: Path
+    ) -> Iterator[Work]:
+        """Do ``work(task, folder)`` for all tasks, one core each, and give each back once it is done.
 
-        A job whose worker dies is tried again, three times; then it is recorded as failed.
+        A task whose worker dies is tried again, three times; then its runs are recorded as failed. Those that are told
+        ``device=cuda`` get a GPU.
+
+        Raises:
+            RuntimeError: if Ray itself fails, or a run can be neither begun nor recorded: that is no result of a run's.
         """
         remote = ray.remote(num_cpus=1, max_retries=3)(work)
-        waiting = {remote.remote(job, folder): job for job in jobs}
+        waiting = {remote.options(num_gpus=_gpus(task)).remote(task, folder): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting), num_returns=1)
-            job = waiting.pop(ready)
+            task = waiting.pop(ready)
             try:
                 ray.get(ready)
+            except (WorkerCrashedError, OutOfMemoryError) as error:
+                for job in task.jobs:
+                    if Ending.read(folder / job.name) is None:  # it may have died after its work was done
+                        Ending("failed", _reason(error)).write(folder / job.name)
             except RayError as error:
-                reason = f"{type(error).__name__}: {str(error).splitlines()[0]}"
-                Ending("failed", reason).write(folder / job.name)
-            yield job
+                raise RuntimeError(
+                    f"{folder}: {task.name} is not finished: {_reason(error)}. Start the same command again: "
+                    "what was finished is kept."
+                ) from error
+            yield task
 
     def close(self) -> None:
         """End the workers of this machine, or leave the cluster."""
         ray.shutdown()
+
+
+def _gpus(task: Job | Pack) -> int:
+    return int(any(word.startswith("device=cuda") for word in task.jobs[0].overrides))
+
+
+def _reason(error: RayError) -> str:
+    cause = error.cause if isinstance(error, RayTaskError) else error
+    return f"{type(cause).__name__}: {shortened(cause)}"
 
 
 def _check_answer(address: str) -> None:

@@ -14,9 +14,10 @@ import numpy as np
 import pandas
 
 from nht.recipes.run.config_file import read_settings
-from nht.recipes.run.folder import CONFIG_FILE, METRICS_FILE, OLDEST_ALGORITHM
+from nht.recipes.run.folder import METRICS_FILE
 from nht.recipes.run.metrics import FAILURE, FRAMES, SECONDS, SUCCESS, tested
 from nht.recipes.run.metrics_file import metrics_table
+from nht.recipes.run.saved_run import CONFIG_FILE, OLDEST_ALGORITHM
 from nht.recipes.study.figures import colour
 from nht.recipes.study.scores import interquartile_mean, interval
 

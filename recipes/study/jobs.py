@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
-from dataclasses import dataclass
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import pandas
 
-from nht.reading import entry, known_entries, read_json, shortened
+from nht.reading import entry, known_entries, read_json, shortened, shown
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.quiet import quiet_libraries
+from nht.recipes.run.folder import MAP_METRICS_FILE
 from nht.recipes.run.metrics import EVERY_RUN
 from nht.recipes.run.metrics_file import metrics_table
-from nht.recipes.run.ownership import claimed
+from nht.recipes.run.ownership import OwnedError, claimed
+from nht.recipes.run.workers import WorkerEndedError
+from nht.recipes.study.rows_file import CORE_SECONDS, MAP_ERROR
 from nht.recipes.study.space import VERSION, Value
-from nht.storage import replacing
+from nht.writing import replacing
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,11 @@ class Job:
         """Of the run's folder, below the search's."""
         return job_name(self.stage, self.interface, self.configuration, self.seed)
 
+    @property
+    def jobs(self) -> tuple[Job, ...]:
+        """The runs that are done together: this one."""
+        return (self,)
+
 
 def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
     """The name of a run, and of its folder below the search's."""
@@ -60,13 +71,23 @@ def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
 
 ENDINGS = ("done", "failed", "diverged")
 
+TRIES = 3
+"""How often a run is started whose workers die: that says nothing about what was drawn. Each goes on where it was."""
+
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run came out: ``done``, ``failed`` or ``diverged``, and why."""
+    """How a run came out.
+
+    Attributes:
+        status: ``done``, ``failed`` or ``diverged``.
+        reason: why.
+        core_seconds: processor time of the process that ended it, its share of it if several runs trained together [s].
+    """
 
     status: str
     reason: str = ""
+    core_seconds: float | None = field(default=None, compare=False)
 
     @classmethod
     def read(cls, run: Path) -> Ending | None:
@@ -79,17 +100,22 @@ class Ending:
         if not file.exists():
             return None
         record = read_json(file)
-        known_entries(record, ("status", "reason"), str(file))
+        known_entries(record, ("status", "reason", "core_seconds"), str(file))
         if entry(record, "status", str, str(file)) not in ENDINGS:
             raise ValueError(
                 f"{file}: 'status' must be one of {list(ENDINGS)}, got {shortened(record['status'], 60)!r}."
             )
-        return cls(record["status"], entry(record, "reason", str, str(file)))
+        spent = record.get("core_seconds")
+        if not (spent is None or (isinstance(spent, int | float) and 0 <= spent < math.inf)):
+            raise ValueError(
+                f"{file}: 'core_seconds' must be a finite number, at least 0, got {shown(spent)}."
+            )
+        return cls(record["status"], entry(record, "reason", str, str(file)), spent)
 
     def write(self, run: Path) -> None:
         """Record it in the run's folder."""
         with replacing(run / "outcome.json") as scratch:
-            scratch.write_text(json.dumps({"status": self.status, "reason": self.reason}))
+            scratch.write_text(json.dumps(asdict(self)))
 
 
 def run_job(job: Job, folder: Path) -> Ending | None:
@@ -100,7 +126,8 @@ def run_job(job: Job, folder: Path) -> Ending | None:
         folder: of the search.
 
     Returns:
-        the outcome, also of a run that had ended before; None if another process is at it.
+        the outcome, also of a run that had ended before; None if another process is at it, whether for this search or,
+        in the run's own folder, for a person.
     """
     run = folder / job.name
     if (outcome := Ending.read(run)) is not None:
@@ -109,13 +136,19 @@ def run_job(job: Job, folder: Path) -> Ending | None:
         if not ours:
             return None
         if (outcome := Ending.read(run)) is None:  # another process may have ended it in the meantime
-            outcome = _train(job, run)
+            begun = time.process_time()
+            try:
+                outcome = _train(job, run)
+            except OwnedError:
+                return None
+            outcome = replace(outcome, core_seconds=time.process_time() - begun)
             outcome.write(run)
             shutil.rmtree(run / "checkpoints", ignore_errors=True)  # buffers are large
     return outcome
 
 
 def _train(job: Job, run: Path) -> Ending:
+    """How the run came out; raises OwnedError if another process writes its folder."""
     run.mkdir(parents=True, exist_ok=True)
     algorithm = find_algorithm(job.recipe)
     overrides = [*job.overrides, f"run.folder={run}", "run.resume=auto"]
@@ -127,12 +160,26 @@ def _train(job: Job, run: Path) -> Ending:
         quiet_libraries()  # in this process, a worker's
         print(f"python -m nht.recipes.{job.recipe}", *overrides)
         try:
-            algorithm.train(configure(algorithm.schema, job.recipe, overrides))
+            _until_workers_live(lambda: algorithm.train(configure(algorithm.schema, job.recipe, overrides)))
+        except OwnedError as error:
+            print(error)
+            raise
         except FloatingPointError as error:
             return Ending("diverged", _line(error))
         except Exception as error:  # noqa: BLE001 - whatever it is, the other runs go on
             return Ending("failed", _line(error))
     return Ending("done")
+
+
+def _until_workers_live(train: Callable[[], None]) -> None:
+    """Train; again, a few times at most, if a collector's worker died."""
+    for left in reversed(range(TRIES)):
+        try:
+            return train()
+        except WorkerEndedError as error:
+            if not left:
+                raise
+            print(f"{error} Tried again, {left} times at most.")
 
 
 def _line(error: Exception) -> str:
@@ -162,4 +209,15 @@ def rows_of(job: Job, folder: Path) -> pandas.DataFrame:
     }
     for place, (name, value) in enumerate(known.items()):
         rows.insert(place, name, value)
-    return rows.assign(**job.parameters)
+    costs = {CORE_SECONDS: outcome.core_seconds, MAP_ERROR: map_error(run)}
+    return rows.assign(
+        **{name: float("nan") if cost is None else cost for name, cost in costs.items()}, **job.parameters
+    )
+
+
+def map_error(run: Path) -> float | None:
+    """The held-out error of the map that a run trained; None if it trained none."""
+    file = run / MAP_METRICS_FILE
+    if not file.exists():
+        return None
+    return float(entry(read_json(file), "validation_error", float, str(file)))

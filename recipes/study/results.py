@@ -10,7 +10,7 @@ import pandas
 from scipy import stats
 
 from nht.recipes.run.metrics import SUCCESS, tested
-from nht.recipes.study.rows_file import COLUMNS, read_rows
+from nht.recipes.study.rows_file import COLUMNS, CORE_SECONDS, MAP_ERROR, read_rows
 from nht.recipes.study.scores import Scores
 
 OURS = "nht"
@@ -45,7 +45,7 @@ class SearchResults:
     @property
     def parameters(self) -> list[str]:
         """The hyperparameters that were drawn."""
-        return [name for name in self.rows.columns if name not in COLUMNS]
+        return [name for name in self.rows.columns if name not in (*COLUMNS, CORE_SECONDS, MAP_ERROR)]
 
     def stage(self, stage: str) -> pandas.DataFrame:
         """The runs of a stage."""

@@ -24,7 +24,10 @@ COLUMNS = (
     "reason",
     *EVERY_RUN,
 )
-"""Of ``rows.csv``; those behind them are hyperparameters."""
+"""Of ``rows.csv``; those behind them are costs, where they were noted, and hyperparameters."""
+
+CORE_SECONDS, MAP_ERROR = "core_seconds", "map_error"
+"""Processor time of the whole run [s], and the held-out error of the map that it trained; same in all its rows."""
 
 CHOICES = {
     "metric": (SUCCESS, RETURN),

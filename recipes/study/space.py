@@ -13,7 +13,7 @@ from zlib import crc32
 import numpy as np
 
 from nht.reading import entry, known_entries, read_json
-from nht.storage import replacing
+from nht.writing import replacing
 
 Value = int | float | str
 ROWS_FORMAT = 1

@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import nht
-from nht.envs import foreign, make_dm_control
+from nht.envs import foreign_copies, make_dm_control
 from nht.envs.dm_control import MISSING
 from nht.recipes import ddpg, evaluate
 from nht.recipes.agents.returns import reward_range
@@ -113,7 +113,7 @@ def test_rewards_know_their_bounds(env):
 
 
 def test_episodes_end_though_the_suite_knows_no_limit(monkeypatch):
-    monkeypatch.setattr(foreign, "LONGEST_EPISODE", 4)
+    monkeypatch.setattr(foreign_copies, "LONGEST_EPISODE", 4)
     with closing(make_dm_control("lqr-lqr_2_1", seed=0)) as env:
         assert env.task.max_episode_steps == 4
         data = env.rollout(9, break_when_any_done=False)["next"]

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import ks_2samp
 
 from nht.envs import TASKS, make_task
-from nht.envs.task import load_model
+from nht.envs.models import load_model
 
 IDS = {
     "ant": "Ant-v5",

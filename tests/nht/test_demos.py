@@ -16,9 +16,10 @@ from torchrl.data import ReplayBuffer
 
 import fresh_process
 import nht
-from nht.demos import Demos, load_demos, save_demos
+from nht.demos import Demos
+from nht.demos_folder import load_demos, save_demos
 from nht.reading import checksum
-from nht.scratch import scratch
+from nht.writing import scratch
 
 
 def episodes(count: int = 4, length: int = 5) -> TensorDict:
@@ -201,12 +202,6 @@ def test_what_a_killed_process_left_is_removed_by_the_next_and_what_lives_stays(
         living.mkdir()
         save(tmp_path / "demos")
         assert living.exists()
-    old, recent = tmp_path / f".demos.{32 * '0'}", tmp_path / f".demos.{32 * '1'}"
-    for folder in (old, recent):  # as they were named without an owner
-        folder.mkdir()
-    os.utime(old, (0, 0))
-    with scratch(tmp_path / "demos"):
-        assert sorted(path.name for path in tmp_path.iterdir()) == [recent.name, "demos"]
 
 
 def test_settings_that_are_not_json_leave_nothing_behind(tmp_path: Path) -> None:

@@ -18,12 +18,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 import nht
+from nht.description import describe
 from nht.export import _solve
 from nht.maps import ActionMap
 from nht.recipes import export_map as recipe
 from nht.recipes.config import ExportMap
 from nht.recipes.launch import configure
-from nht.storage import describe
 from nht.transforms import ActionMapTransform
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

@@ -13,7 +13,7 @@ from torch import Tensor
 import nht
 from nht.demos import Demos
 from nht.envs import wam_kinematics as wam
-from nht.envs.task import ASSETS
+from nht.envs.models import ASSETS
 from nht.train import train_map
 
 

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 import nht
 from nht.demos import Demos
 from nht.maps import ActionMap
-from nht.storage import check_storable, load_map, save_map
+from nht.storable import check_storable
+from nht.storage import load_map, save_map
 
 FILES = Path(__file__).parent / "files"
 PACKAGE = """

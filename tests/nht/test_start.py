@@ -12,7 +12,7 @@ from torch import Tensor
 import nht
 from nht.demos import Demos
 from nht.geometry import householder_frame, principal_directions, spanning_reflectors, sphere_exp, sphere_log
-from nht.train import split_episodes
+from nht.training_data import split_episodes
 
 N, K, CONTEXT_DIM = 6, 2, 3
 

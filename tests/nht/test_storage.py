@@ -2,6 +2,9 @@
 
 import json
 import pickle
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ from torch import Tensor
 
 import nht
 from nht.maps import ActionMap
+from nht.replacing import replacing
 from nht.storage import _checksum, load_map, save_map
 
 KEYS = ("tool_position", ("arm", "joint_angle"))
@@ -242,3 +246,27 @@ def test_files_that_do_not_fit_are_refused(path: Path, change: dict[str, Any], m
     rewrite(path, **change)
     with pytest.raises(ValueError, match=message):
         load_map(path)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from nht.replacing import replacing
+with replacing(Path(sys.argv[1])) as scratch:
+    scratch.write_text("half of")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_writer_left_goes_when_the_file_is_written_again(tmp_path: Path) -> None:
+    file, other = tmp_path / "config.yaml", tmp_path / "other.yaml"
+    file.write_text("old")
+    process = subprocess.run([sys.executable, "-c", KILLED, file], timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.iterdir())) == 2
+    assert file.read_text() == "old"
+    with replacing(other) as scratch, replacing(file) as scratch_too:  # of a living one, nothing is taken
+        scratch.write_text("new")
+        scratch_too.write_text("new")
+    assert sorted(tmp_path.iterdir()) == [file, other]
+    assert file.read_text() == "new"

@@ -11,7 +11,8 @@ from nht import train
 from nht.demos import Demos
 from nht.maps import ActionMap, LinearActionMap
 from nht.networks import ContextNetwork
-from nht.train import projection_error, split_episodes, train_map
+from nht.train import projection_error, train_map
+from nht.training_data import split_episodes
 
 N, K, CONTEXT_DIM, EPISODES, LENGTH = 6, 2, 3, 40, 50
 

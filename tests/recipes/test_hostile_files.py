@@ -17,14 +17,16 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
 import nht
-from nht.memmap import read_tensordict, write_tensordict
-from nht.recipes import collect_demos, inspect_demos
+import tiny_runs
+from nht.memmap import read_tensordict
+from nht.memmap_files import write_tensordict
+from nht.recipes import collect_demos, evaluate, inspect_demos
 from nht.recipes.agents.policy_file import read_policy, write_policy
-from nht.recipes.config import CollectDemos
+from nht.recipes.config import CollectDemos, Evaluate
 from nht.recipes.launch import configure
 from nht.recipes.run.checkpoint_file import CheckpointFile
 from nht.recipes.run.checkpoints import Checkpoints
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.saved_run import read_config
 from nht.recipes.run.statistics import Counters
 from toy_demos import demonstrations, episodes, write_hdf5
 from untouched import only_reads
@@ -757,6 +759,7 @@ LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
         ("recipe: nonsense", r"unknown algorithm 'nonsense'"),
         ("seed: x", "is no configuration of a run"),
         ("elbow: 1", "is no configuration of a run: .*elbow"),
+        ("env: {num_threads: 1000000}", r"env.num_threads must be in 1 ... 1024, got 1000000"),
         ("\x00", "is not YAML"),
     ],
 )
@@ -772,3 +775,32 @@ def test_code_that_a_configuration_names_can_be_allowed(tmp_path):
     with pytest.raises(ValueError, match=re.escape("allow=[my_package]")):
         read_config(tmp_path, allow=["my_pack"])
     assert read_config(tmp_path, allow=["my_package"]).env.name == "my_package.tasks:Pour"
+
+
+@pytest.fixture(scope="module", params=tiny_runs.RECIPES)
+def small_run(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param) / "run"
+    tiny_runs.train(request.param, folder, "algo.total_frames=200", "evaluation.every=200")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("hidden", "message"),
+    [
+        ([10**6, 10**6], r"describes a policy far larger than the [\d,]+ bytes of policy.safetensors"),
+        ([10**12, 10**12], "describes a policy far larger"),
+        ([10**30], "describes a policy far larger"),
+        ([-1], "describes no policy: .*negative"),
+        ([8], "policy.safetensors is not of this policy"),
+    ],
+)
+def test_a_configuration_of_huge_networks_builds_none(small_run, hidden, message):
+    settings = small_run / "config.yaml"
+    told = settings.read_text()
+    try:
+        settings.write_text(told.replace("  - 16\n  - 16\n", "".join(f"  - {one}\n" for one in hidden)))
+        assert settings.read_text() != told
+        with pytest.raises(ValueError, match=message):
+            evaluate.main(Evaluate(run=str(small_run), episodes=2, video=False))
+    finally:
+        settings.write_text(told)

@@ -11,6 +11,9 @@ from tensordict import TensorDict
 import nht
 from nht.recipes import inspect_demos
 from nht.recipes.config import InspectDemos
+from nht.recipes.data import summary
+from nht.recipes.data.figure import draw
+from nht.recipes.data.files import Episodes
 from nht.recipes.launch import configure
 
 LENGTHS = [4, 8, 6]
@@ -66,14 +69,14 @@ def test_the_summary_says_what_is_in_the_demonstrations(saved, capsys):
 
 
 def test_success_is_that_of_the_last_steps(saved):
-    text = inspect_demos.summary(inspect_demos.read(str(saved)), directions=4)
+    text = summary.summary(inspect_demos.read(str(saved)), directions=4)
     assert "success  0.667 of the episodes, at their last step" in text
     assert "not finite  none" in text
 
 
 def test_energy_is_that_of_the_singular_vectors():
     actuation = demonstrations(directions=3)["actuation"]
-    shares = inspect_demos.energy(actuation)
+    shares = summary.energy(actuation)
     singular = torch.linalg.svdvals(actuation.double()) ** 2
     np.testing.assert_allclose(shares, singular.cumsum(0) / singular.sum(), rtol=1e-12)
     map = nht.SVD(4, 2)
@@ -84,7 +87,7 @@ def test_energy_is_that_of_the_singular_vectors():
     missed = nht.projection_error(map, torch.zeros(18, 0), actuation)
     assert 1 - shares[1] == pytest.approx(missed, rel=1e-4)
     with_nan = torch.cat([actuation, torch.full((1, 4), torch.nan)])
-    np.testing.assert_array_equal(inspect_demos.energy(with_nan), shares)
+    np.testing.assert_array_equal(summary.energy(with_nan), shares)
 
 
 @pytest.mark.parametrize("motors", [1, 30])
@@ -99,7 +102,7 @@ def test_the_figure_is_drawn_for_any_number_of_motors_and_episodes(motors, tmp_p
             batch_size=total,
         )
         data["actuation"][:, 0] = 0.0  # a motor that stands still
-        figure = inspect_demos.draw(inspect_demos.Episodes(data, 0), directions=10)
+        figure = draw(Episodes(data, 0), directions=10)
         figure.savefig(tmp_path / "figure.png", dpi=30)
         assert iio.imread(tmp_path / "figure.png").std() > 10
 

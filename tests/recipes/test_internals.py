@@ -15,7 +15,7 @@ from nht.recipes.agents.ddpg import DDPGConfig, PaperDDPGLoss, networks
 from nht.recipes.config import DDPG
 from nht.recipes.hydra_internals import choices
 from nht.recipes.launch import configure
-from nht.recipes.torch_internals import lerp_all
+from nht.recipes.torch_internals import layout_versions, lerp_all, set_layout_versions
 from nht.recipes.torchrl_internals import (
     carrier,
     count_frames_from,
@@ -91,3 +91,22 @@ def test_hydra_says_where_it_found_nothing_and_lists_choices():
         configure(DDPG, "ddpg", ["algo.gama=0.9"])
     with pytest.raises(ValueError, match=r"Could not find 'algo/none'.*ddpg_paper"):
         configure(DDPG, "ddpg", ["algo=none"])
+
+
+def test_torch_keeps_layout_versions_in__metadata_and_looks_at_them_when_it_loads():
+    class Versioned(torch.nn.Linear):
+        _version = 7
+
+        def _load_from_state_dict(self, state, prefix, local_metadata, *args):
+            self.seen = local_metadata.get("version")
+            super()._load_from_state_dict(state, prefix, local_metadata, *args)
+
+    network = Versioned(1, 1)
+    state = network.state_dict()
+    versions = layout_versions(state)
+    assert versions[""] == {"version": 7}
+    again = type(state)(state)
+    assert layout_versions(again) is None
+    set_layout_versions(again, versions)
+    network.load_state_dict(again)
+    assert network.seen == 7

@@ -27,8 +27,8 @@ from nht.recipes.data.files import read_episodes
 from nht.recipes.launch import configure
 from nht.recipes.run.checkpoint_file import CheckpointFile
 from nht.recipes.run.checkpoints import Checkpoints
-from nht.recipes.run.folder import read_config
 from nht.recipes.run.metrics_file import read_metrics
+from nht.recipes.run.saved_run import read_config
 from nht.recipes.run.statistics import Counters
 from nht.recipes.sections import SourceConfig
 from nht.recipes.study.jobs import Ending

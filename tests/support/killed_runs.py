@@ -7,17 +7,22 @@ import time
 import tiny_runs
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["killed_runs", "nht.recipes.ddpg", "nht.recipes.ppo"])
+CONTEXT.set_forkserver_preload(["killed_runs", "killed_ranks", "nht.recipes.ddpg", "nht.recipes.ppo"])
 
 
 def train(algorithm, folder, overrides, barrier=None):
     """What a process does; its words go to a file beside the run's folder."""
     if barrier is not None:
         barrier.wait()
-    log = os.open(folder.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    speak_into(folder.with_suffix(".log"))
+    tiny_runs.train(algorithm, folder, "run.resume=auto", *overrides)
+
+
+def speak_into(file):
+    """Let this process write what it says into a file, behind what stands there."""
+    log = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(log, 1)
     os.dup2(log, 2)
-    tiny_runs.train(algorithm, folder, "run.resume=auto", *overrides)
 
 
 def start(algorithm, folder, overrides, barrier=None):

@@ -152,3 +152,21 @@ def test_vec_gym_env_transform_goes_before_what_is_raw():
     chain.transforms[1]._step = lambda _, observed: observed
     chain._step(data, data["next"])
     assert order == ["completed", "read"]
+
+
+def test_transforms_are_told_before_the_environment_is_reset():
+    told = []
+
+    class Told(EarlyReader):
+        def before_reset(self):
+            told.append("before")
+
+    class Noting(ToyArm):
+        def _reset(self, tensordict=None, **options):
+            told.append("reset")
+            return super()._reset(tensordict, **options)
+
+    env = TransformedEnv(Noting(), Compose(StepCounter(), Told()))
+    told.clear()
+    env.reset()
+    assert told == ["before", "reset"]

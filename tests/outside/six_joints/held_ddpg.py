@@ -23,7 +23,6 @@ from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
@@ -84,7 +83,7 @@ def main(config: HeldDDPG) -> None:
                 target.step()
                 record.count_update(losses)
             if record.evaluation_due:
-                record.log(evaluate(envs.test, acting))
+                record.evaluate(acting)
     loop.finish(acting)
 
 

@@ -20,7 +20,7 @@ from nht.recipes.agents.off_policy import STORED, minibatches, replay_buffer, st
 from nht.recipes.agents.td3 import DirectTD3Loss, TD3Config, networks
 from nht.recipes.config import CollectDemos, Evaluate
 from nht.recipes.launch import configure
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.saved_run import read_config
 
 ALGORITHMS = ("sac", "td3")
 SHORT = ("algo.total_frames=100", "evaluation.every=100", "algo.random_frames=0")

@@ -13,7 +13,8 @@ from nht.recipes import ddpg, evaluate, ppo
 from nht.recipes.agents.ppo import GaussianPPOLoss
 from nht.recipes.config import DDPG, PPO, Evaluate
 from nht.recipes.launch import configure
-from nht.recipes.run.folder import RunFolder, read_config
+from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.saved_run import read_config
 
 TINY = [
     "env=wam_wipe",

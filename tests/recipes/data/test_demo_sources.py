@@ -19,7 +19,7 @@ from nht.recipes.config import DDPG, CollectDemos
 from nht.recipes.data.recording import endings, has_success, record
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import mapped_env
-from nht.recipes.run.folder import read_config
+from nht.recipes.run.saved_run import read_config
 from nht.recipes.sections import DemosConfig
 from toy_demos import CONTEXT, FLAGS, LENGTHS, as_rollout, demonstrations, episodes, same, write_hdf5
 

@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+import time
 
 import pytest
 import yaml
@@ -13,6 +14,7 @@ from nht.recipes.launch import configure
 from nht.recipes.run.dashboard import logged_in, open_dashboard, wanted
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.record import Record
 
 TINY = [
     "env.options.max_episode_steps=9",
@@ -42,11 +44,20 @@ def records(file):
             parts = b""
 
 
+def written(folder):
+    """The records of the offline run in a folder, once W&B's own process has written the last one."""
+    (file,) = folder.glob("wandb/offline-run-*/*.wandb")
+    until = time.monotonic() + 60
+    while not any(record.HasField("exit") for record in records(file)):
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    return list(records(file))
+
+
 def read_back(folder):
     """The configuration and the rows of the offline run in a folder."""
-    (file,) = folder.glob("wandb/offline-run-*/*.wandb")
     config, rows = {}, []
-    for record in records(file):
+    for record in written(folder):
         for item in [*record.run.config.update, *record.config.update]:
             place = config
             *outer, last = list(item.nested_key) or [item.key]
@@ -143,6 +154,29 @@ def test_an_empty_key_does_not_stop_a_run_whatever_its_folders_name(nobody, monk
     config, rows = read_back(nobody)
     assert config["seed"] == 3
     assert rows[0]["eval_return"] == 1.0
+
+
+def test_a_run_does_not_write_into_one_that_this_process_has_left_open(nobody):
+    folders = [nobody / "first", nobody / "second"]
+    dashboards = []
+    for number, folder in enumerate(folders):
+        folder.mkdir()
+        dashboards.append(open_dashboard(folder, {"seed": number}, RunConfig()))
+        dashboards[-1].log(10, {"eval_return": float(number)})
+    for dashboard in dashboards:
+        dashboard.leave()
+    for number, folder in enumerate(folders):
+        config, rows = read_back(folder)
+        assert config["seed"] == number
+        assert [row["eval_return"] for row in rows] == [number]
+
+
+def test_a_run_that_fails_is_closed_as_failed(tmp_path, monkeypatch):
+    monkeypatch.setattr(Record, "count_steps", lambda self, data: 1 / 0)
+    folder = tmp_path / "run"
+    with pytest.raises(ZeroDivisionError):
+        tiny_runs.train("ddpg", folder, *TINY)
+    assert [record.exit.exit_code for record in written(folder) if record.HasField("exit")] == [1]
 
 
 def test_an_unknown_mode_is_told_in_a_sentence(nobody, monkeypatch):

@@ -16,7 +16,7 @@ import tiny_runs
 from nht.recipes import evaluate
 from nht.recipes.config import Evaluate
 from nht.recipes.launch import configure
-from nht.recipes.run.folder import kept_map, read_config
+from nht.recipes.run.saved_run import kept_map, read_config
 
 OLD = Path(tiny_runs.__file__).with_name("old_run")
 SETTINGS = ["map=nht", "map.hidden=[8]", "map.max_steps=250", "demos.transitions=1000", "algo.hidden=[8,8]"]

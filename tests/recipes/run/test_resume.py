@@ -16,7 +16,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 import fresh_process
 import tiny_runs
 from nht.recipes.run import checkpoints, folder
-from nht.recipes.run.checkpoint_file import CheckpointFile, write_checkpoint
+from nht.recipes.run.checkpoint_file import CheckpointFile
+from nht.recipes.run.checkpoint_writing import write_checkpoint
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.record import Record
 from nht.recipes.run.statistics import Counters

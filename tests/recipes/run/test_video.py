@@ -1,5 +1,7 @@
 """Films of test episodes: what is on them, and that the last moment is."""
 
+import sys
+
 import imageio.v3 as imageio
 import numpy as np
 import pytest
@@ -8,6 +10,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 import nht
+import tiny_runs
+from nht.envs import make_env
+from nht.envs.rendering import coarse_shadows
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.video import (
@@ -146,3 +151,43 @@ def test_films_of_long_episodes_are_short(steps, time_per_step, speed):
     assert film.frames_per_second >= min(JERKY, 1 / time_per_step)
     seconds = steps * time_per_step / speed
     assert len(film.frames) / film.frames_per_second == pytest.approx(seconds, rel=0.03)
+
+
+@pytest.mark.usefixtures("can_render")
+def test_coarse_shadows_leave_the_model_and_other_renderers_alone():
+    task = wipe().base_env.task
+    quality, screen = task.model.vis.quality, task.model.vis.global_
+    before = quality.shadowsize, screen.offwidth, screen.offheight
+    plain = task.renderer(64, 48)
+    with coarse_shadows(16):
+        coarse = task.renderer(64, 48)
+        assert (quality.shadowsize, screen.offwidth, screen.offheight) == before
+    again = task.renderer(64, 48)
+    pictures = [renderer.frame(0) for renderer in (plain, coarse, again)]
+    np.testing.assert_array_equal(pictures[0], pictures[2])
+    differing = (pictures[0] != pictures[1]).any(-1).mean()
+    assert 0 < differing < 0.1  # nothing but the edges of shadows
+    for renderer in (plain, coarse, again):
+        renderer.close()
+
+
+@pytest.mark.usefixtures("can_render")
+def test_a_picture_may_be_larger_than_the_models_own_buffer():
+    task = make_env("half_cheetah", seed=0).task
+    assert task.model.vis.global_.offwidth < 800
+    renderer = task.renderer(800, 600)
+    assert renderer.frame(0).shape == (600, 800, 3)
+    renderer.close()
+
+
+def test_without_the_package_that_draws_it_a_task_is_trained_and_not_filmed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    told = ["env=gymnasium", "env.name=Pendulum-v1", "map.action_scale=2", "evaluation.video=true"]
+    told = [*told, "algo.total_frames=200", "evaluation.every=200"]
+    metrics = tiny_runs.train("ppo", tmp_path / "run", *told)
+    assert metrics["frames"].tolist() == [200]
+    said = capsys.readouterr().out
+    assert "no video: the environment cannot be drawn: pygame is not installed" in said
+    assert "gymnasium[classic" in said
+    assert not (tmp_path / "run" / "video.mp4").exists()
+    assert (tmp_path / "run" / "whole.json").exists()

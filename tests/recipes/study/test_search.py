@@ -10,13 +10,16 @@ from types import SimpleNamespace
 
 import pandas
 import pytest
+from ray import exceptions as ray_errors
 
 from nht.recipes import search
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.config import Search, SearchConfig
 from nht.recipes.launch import configure
+from nht.recipes.run.ownership import claimed
+from nht.recipes.run.workers import WorkerEndedError
 from nht.recipes.study import cluster as cluster_module
-from nht.recipes.study.jobs import Ending, Job, rows_of, run_job
+from nht.recipes.study.jobs import TRIES, Ending, Job, rows_of, run_job
 
 BASE = [
     "evaluation.every=200",
@@ -194,6 +197,38 @@ def test_nobody_runs_what_another_one_is_at(recipe, tmp_path):
     assert len(recipe.configs) == 1
 
 
+def test_a_run_whose_workers_died_is_tried_again(recipe, tmp_path):
+    def die_once(config):
+        if len(recipe.configs) == 1:
+            raise WorkerEndedError("collector: worker 0 was killed by SIGKILL.")
+
+    recipe.act = die_once
+    assert run_job(job(), tmp_path) == Ending("done")
+    assert len(recipe.configs) == 2
+    assert recipe.configs[0] == recipe.configs[1]  # from its last checkpoint, by run.resume=auto
+    said = (tmp_path / job().name / "train.log").read_text()
+    assert "worker 0 was killed by SIGKILL. Tried again, 2 times at most." in said
+
+
+def test_a_run_whose_workers_always_die_fails_at_last(recipe, tmp_path):
+    def die(config):
+        raise WorkerEndedError("collector: worker 0 was killed by SIGKILL.")
+
+    recipe.act = die
+    ending = Ending("failed", "WorkerEndedError: collector: worker 0 was killed by SIGKILL.")
+    assert run_job(job(), tmp_path) == ending
+    assert len(recipe.configs) == TRIES
+
+
+def test_a_run_that_a_person_has_started_is_waited_for(tmp_path):
+    run = tmp_path / job().name
+    with claimed(run / ".owner"):
+        assert run_job(job(), tmp_path) is None
+        assert "is being written by process" in (run / "train.log").read_text()
+    assert Ending.read(run) is None
+    assert not list((tmp_path / "claims").iterdir())  # free for whoever comes next
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -260,6 +295,50 @@ def test_on_ray_stopped_and_gone_on(tmp_path):
     rows = pandas.read_csv(folder / "rows.csv", keep_default_na=False)
     assert set(rows["status"]) == {"done"}
     assert len(rows[["stage", "interface", "configuration", "seed"]].drop_duplicates()) == 6
+
+
+def fake_ray(error):
+    """As much of Ray as a cluster's ``run`` asks for; every job raises ``error``."""
+
+    def get(_):
+        raise error
+
+    def remote(**_):
+        return lambda work: SimpleNamespace(remote=lambda job, folder: job.name)
+
+    return SimpleNamespace(remote=remote, wait=lambda waiting, num_returns: (waiting[:1], []), get=get)
+
+
+def run_on(monkeypatch, error, folder):
+    monkeypatch.setattr(cluster_module, "ray", fake_ray(error))
+    cluster = object.__new__(cluster_module.Cluster)  # Ray is not started
+    return list(cluster.run(run_job, [job()], folder))
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ray_errors.LocalRayletDiedError(), "LocalRayletDiedError: The task's local raylet died"),
+        (ray_errors.NodeDiedError("gone"), "NodeDiedError: gone"),
+        (ray_errors.RayTaskError("run_job", "a traceback", OSError("no room")), "OSError: no room"),
+    ],
+)
+def test_what_is_no_fault_of_a_run_is_not_recorded_as_one(error, reason, monkeypatch, tmp_path):
+    told = rf"the run search/raw/000-seed0 is not finished: {reason}.*\. Start the same command again"
+    with pytest.raises(RuntimeError, match=told):
+        run_on(monkeypatch, error, tmp_path)
+    assert Ending.read(tmp_path / job().name) is None
+
+
+def test_a_job_whose_worker_always_dies_fails_unless_it_had_ended(monkeypatch, tmp_path):
+    error = ray_errors.WorkerCrashedError()
+    assert run_on(monkeypatch, error, tmp_path) == [job()]
+    found = Ending.read(tmp_path / job().name)
+    assert found.status == "failed"
+    assert found.reason.startswith("WorkerCrashedError: The worker died unexpectedly")
+    Ending("done").write(tmp_path / job().name)
+    run_on(monkeypatch, error, tmp_path)
+    assert Ending.read(tmp_path / job().name) == Ending("done")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, and stay after a power cut.
+"""Writing files and folders that appear whole or not at all, and stay after a power cut.
 
 Each is written beside its place under a hidden name that says which process writes it, brought to disk, and renamed.
 What a killed process left behind is known by that name, and removed by the next one that writes there.
@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import socket
+import stat
 import time
 import uuid
 from collections.abc import Iterator
@@ -39,6 +40,20 @@ def scratch(path: Path) -> Iterator[Path]:
         yield place
     finally:
         _remove(place)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A scratch file of the same name, which takes the place of ``path`` once it is written whole and on disk.
+
+    Its permissions are those of any new file: the umask's. Whatever fails leaves ``path`` as it was.
+    """
+    with scratch(path) as folder:
+        folder.mkdir(mode=0o700)
+        place = folder / path.name  # some writers look at the end of the name
+        yield place
+        place.chmod(_mode_of_new_files(folder))
+        publish(place, path)
 
 
 def publish(source: Path, path: Path) -> None:
@@ -86,6 +101,13 @@ def remove_leftovers(folder: Path, name: str | None = None) -> list[Path]:
             _remove(place)
             dead.append(place)
     return dead
+
+
+def _mode_of_new_files(folder: Path) -> int:
+    """Asked of a file that is just made, for reading the umask means setting it, for other threads too."""
+    probe = folder / f"{uuid.uuid4().hex}.mode"
+    probe.touch()
+    return stat.S_IMODE(probe.stat().st_mode)
 
 
 def _is_dead(owner: re.Match[str]) -> bool:

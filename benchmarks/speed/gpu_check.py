@@ -1,0 +1,115 @@
+"""Whether everything computes on a GPU what it computes on the CPU, and how fast: for a machine that has one.
+
+python benchmarks/speed/gpu_check.py                 # on a GPU, less than ten minutes
+python benchmarks/speed/gpu_check.py --device cpu    # the same steps where there is none
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas
+import torch
+
+from nht.recipes.agents.table import find_algorithm
+from nht.recipes.launch import configure
+
+ROOT = Path(__file__).resolve().parents[2]
+TASKS = {"wam_wipe": "nht", "half_cheetah": "none"}
+"""Each with the kind of map that drives it."""
+ALGORITHMS = ("ddpg", "td3", "sac", "ppo")
+OFF_POLICY = ("algo.warmup_frames=0", "algo.updates_per_batch=20", "algo.random_frames=0")
+ON_POLICY = ("algo.frames_per_batch=2000", "env.num_envs=10")
+SHARED = (
+    "algo.total_frames=4000",
+    "evaluation.every=2000",
+    "evaluation.episodes=5",
+    "evaluation.video=false",
+    "run.checkpoint_every=4000",
+    "run.wandb=false",
+    "demos.transitions=2000",
+    "map.max_steps=200",
+    "env.options.max_episode_steps=200",
+)
+TOLERANCE = 0.05
+"""Relative: of the losses' means over the first updates. Sums in another order grow apart as training goes on."""
+
+
+def main() -> None:
+    """Run the GPU's tests, then train a little with every algorithm, on the device and on the CPU."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--tests", action=argparse.BooleanOptionalAction, default=True)
+    told = parser.parse_args()
+    print(f"torch {torch.__version__}, {name_of(told.device)}")
+    if told.tests:
+        run_tests()
+    with tempfile.TemporaryDirectory() as scratch:
+        rows = list(compared(Path(scratch), told.device))
+    table = pandas.DataFrame(rows)
+    print(table.to_string(index=False))
+    if wrong := table.loc[~table["agrees"], ["task", "algorithm"]].to_numpy().tolist():
+        sys.exit(f"the losses on {told.device} are not those on the CPU: {wrong}")
+
+
+def name_of(device: str) -> str:
+    """What computes."""
+    return torch.cuda.get_device_name() if device.startswith("cuda") else device
+
+
+def run_tests() -> None:
+    """The tests that need a GPU, which other machines pass over, and those of what must never wait for one."""
+    files = ["tests/envs/test_envs.py", "tests/transforms/test_transform_specs.py"]
+    files += ["tests/nht/test_maps_on_gpus.py", "tests/recipes/agents/test_updates_on_gpus.py"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "--import-mode=importlib",
+        "-k",
+        "cuda or gpu or test_device",
+        *files,
+    ]
+    subprocess.run(command, cwd=ROOT, check=True)
+
+
+def compared(scratch: Path, device: str) -> Iterator[dict[str, object]]:
+    """A row for every task and algorithm: speeds on the device, and whether its first losses are the CPU's."""
+    for task, map in TASKS.items():
+        for algorithm in ALGORITHMS:
+            runs = [
+                trained(scratch / f"{task}-{algorithm}-{place}", task, map, algorithm, where)
+                for place, where in (("cpu", "cpu"), ("device", device))
+            ]
+            losses = [column for column in runs[0] if column.startswith("loss")]
+            expected, found = (run[losses].iloc[0] for run in runs)
+            difference = ((found - expected).abs() / expected.abs().clip(lower=1e-3)).max()
+            slow, fast = (run[["frames", "updates", "seconds"]].diff().iloc[-1] for run in runs)
+            yield {
+                "task": task,
+                "algorithm": algorithm,
+                "frames/s": round(fast["frames"] / fast["seconds"], 1),
+                "frames/s on the CPU": round(slow["frames"] / slow["seconds"], 1),
+                "ms an update, all told": round(1e3 * fast["seconds"] / fast["updates"], 2),
+                "difference": float(difference),
+                "agrees": bool(difference <= TOLERANCE),
+            }
+
+
+def trained(folder: Path, task: str, map: str, algorithm: str, device: str) -> pandas.DataFrame:
+    """The metrics of a short run. The first of its two rows is the one in which kernels are loaded."""
+    record = find_algorithm(algorithm)
+    own = ON_POLICY if algorithm == "ppo" else OFF_POLICY
+    overrides = [f"env={task}", f"map={map}", *SHARED, *own, f"device={device}", f"run.folder={folder}"]
+    record.train(configure(record.schema, algorithm, overrides))
+    return pandas.read_csv(folder / "metrics.csv")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""MuJoCo's warnings, told to Python's logging: MuJoCo itself writes them to the console and into the working folder."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+
+LOGGER = logging.getLogger(__name__)
+NUMBER = re.compile(r"-?\d+(\.\d+)?([eE][+-]?\d+)?")
+_told: set[tuple[int, str]] = set()
+"""Of warnings that were told: at which level, and all but the numbers in them."""
+
+
+@contextmanager
+def warnings_logged(level: int = logging.WARNING, *, others: bool = False) -> Iterator[None]:
+    """Within, what MuJoCo warns of goes to this module's logger, and no ``MUJOCO_LOG.TXT`` is written.
+
+    A diverging simulation warns at every step: of warnings that differ in their numbers only, the first is told.
+    Serves as a decorator, too.
+
+    Args:
+        level: of the log's records.
+        others: whether this takes the place of a handler that somebody else gave MuJoCo, dm_control for one.
+    """
+    previous = mujoco.get_mju_user_warning()
+    if previous is not None and not others:
+        yield
+        return
+
+    def tell(text: str) -> None:
+        kind = (level, NUMBER.sub("", text))
+        if kind not in _told:
+            _told.add(kind)
+            LOGGER.log(level, "MuJoCo: %s", text.strip())
+
+    mujoco.set_mju_user_warning(tell)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)

@@ -1,0 +1,20 @@
+"""Settings that may differ between the learners of a population."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+from torch import Tensor
+
+Setting: TypeAlias = float | Tensor
+"""A number for one learner or for all, or numbers ``(L,)`` for L of them."""
+
+
+def beside(setting: Setting, values: Tensor) -> Setting:
+    """The setting in the shape in which it goes with values ``(L, *batch)``."""
+    return setting.view(-1, *[1] * (values.ndim - 1)) if isinstance(setting, Tensor) else setting
+
+
+def largest(setting: Setting) -> float:
+    """The number, or the largest of all."""
+    return float(setting.max()) if isinstance(setting, Tensor) else setting

@@ -1,0 +1,75 @@
+"""Networks of one shape as one network whose parameters have a leading dimension of learners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class StackedLinear(nn.Module):
+    """Linear layers of several learners: one batched matrix product.
+
+    Args:
+        layers: of one shape.
+    """
+
+    def __init__(self, layers: Sequence[nn.Linear]) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.stack([layer.weight.data for layer in layers]))  # (L, out, in)
+        self.bias = nn.Parameter(torch.stack([layer.bias.data for layer in layers]))  # (L, out)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """``(L, *batch, in)`` to ``(L, *batch, out)``."""
+        rows = inputs.flatten(1, -2)
+        product = torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight.mT)
+        return product.view(*inputs.shape[:-1], -1)
+
+
+def stacked(networks: Sequence[Network]) -> Network:
+    """One network of the same class for all learners: what reads ``(*batch, size)`` reads ``(L, *batch, size)``.
+
+    Its linear layers become ``StackedLinear``, every other parameter and buffer gets a leading dimension; names stay,
+    so that ``of_learner`` gives the state of one of the networks.
+
+    Args:
+        networks: of one shape, one for each learner. Modules with parameters of their own beside linear layers must
+            be written for a leading dimension.
+
+    Raises:
+        ValueError: if their parameters are of different shapes; names the learner.
+    """
+    shapes = [{name: tuple(value.shape) for name, value in each.state_dict().items()} for each in networks]
+    for place, found in enumerate(shapes):
+        if found != shapes[0]:
+            raise ValueError(
+                f"learners of one population have networks of one shape: learner 0 has {shapes[0]}, "
+                f"learner {place} has {found}."
+            )
+    result = deepcopy(networks[0])
+    _stack_into(result, networks)
+    return result
+
+
+def _stack_into(result: nn.Module, networks: Sequence[nn.Module]) -> None:
+    for name, value in result.named_parameters(recurse=False):
+        values = [getattr(network, name).data for network in networks]
+        setattr(result, name, nn.Parameter(torch.stack(values), requires_grad=value.requires_grad))
+    for name, _ in result.named_buffers(recurse=False):
+        setattr(result, name, torch.stack([getattr(network, name) for network in networks]))
+    for name, child in result.named_children():
+        children: list[Any] = [network.get_submodule(name) for network in networks]
+        if isinstance(child, nn.Linear):
+            setattr(result, name, StackedLinear(children))
+        else:
+            _stack_into(child, children)
+
+
+def of_learner(state: Mapping[str, Tensor], learner: int) -> dict[str, Tensor]:
+    """The state of one learner's network, from that of a ``stacked`` one."""
+    return {name: value[learner].clone() for name, value in state.items()}

@@ -1,0 +1,124 @@
+"""A generator of random numbers for each of several learners, behind calls that draw for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+from torch.overrides import TorchFunctionMode
+
+IN_PLACE: dict[Callable[..., Any], str] = {Tensor.normal_: "normal_", Tensor.uniform_: "uniform_"}
+FRESH: dict[Callable[..., Any], str] = {torch.randn: "normal_", torch.rand: "uniform_"}
+LIKE: dict[Callable[..., Any], str] = {torch.randn_like: "normal_", torch.rand_like: "uniform_"}
+OTHERS = {
+    torch.bernoulli,
+    torch.multinomial,
+    torch.normal,
+    torch.poisson,
+    torch.randint,
+    torch.randint_like,
+    torch.randperm,
+    Tensor.bernoulli_,
+    Tensor.cauchy_,
+    Tensor.exponential_,
+    Tensor.geometric_,
+    Tensor.log_normal_,
+    Tensor.multinomial,
+    Tensor.random_,
+}
+"""What draws, too, but has no part for each learner: it would make one depend on the others."""
+
+
+class Draws:
+    """The generators of several learners: what one draws is what it would draw alone.
+
+    Args:
+        seeds: one for each learner.
+        device: of the tensors drawn.
+    """
+
+    def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
+        self.generators = [Generator(device).manual_seed(seed) for seed in seeds]
+
+    @contextmanager
+    def of(self, learner: int) -> Iterator[None]:
+        """Within, torch itself draws from the generator of one learner; on the CPU."""
+        generator, before = self.generators[learner], torch.get_rng_state()
+        torch.set_rng_state(generator.get_state())
+        try:
+            yield
+        finally:
+            generator.set_state(torch.get_rng_state())
+            torch.set_rng_state(before)
+
+    def for_all(self) -> TorchFunctionMode:
+        """Within, normal and uniform tensors ``(L, ...)`` are drawn learner by learner, each from its own generator.
+
+        Raises:
+            RuntimeError: there, for a draw that has no part for each learner.
+        """
+        return _LearnerByLearner(self.generators)
+
+    def integers(self, high: int, counts: Sequence[int]) -> list[Tensor]:
+        """For each learner its number of integers below ``high``."""
+        return [
+            torch.randint(0, high, (count,), generator=generator, device=generator.device)
+            for count, generator in zip(counts, self.generators, strict=True)
+        ]
+
+    def orders(self, size: int) -> Tensor:
+        """For each learner the numbers 0 ... size - 1 in a random order, ``(L, size)``."""
+        return torch.stack(
+            [
+                torch.randperm(size, generator=generator, device=generator.device)
+                for generator in self.generators
+            ]
+        )
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The generators' states, ``(L, bytes)``."""
+        return {"states": torch.stack([generator.get_state() for generator in self.generators])}
+
+    def load_state_dict(self, saved: Mapping[str, Tensor]) -> None:
+        """Go on drawing from ``saved``."""
+        for generator, state in zip(self.generators, saved["states"], strict=True):
+            generator.set_state(state.clone())
+
+
+class _LearnerByLearner(TorchFunctionMode):
+    def __init__(self, generators: Sequence[Generator]) -> None:
+        super().__init__()
+        self._generators = generators
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        given = kwargs or {}
+        if func in IN_PLACE:
+            return self._fill(IN_PLACE[func], *args, **given)
+        if func in LIKE:
+            return self._fill(LIKE[func], torch.empty_like(*args, **given))
+        if func in FRESH:
+            return self._fill(FRESH[func], torch.empty(*args, **given))
+        if func in OTHERS:
+            raise RuntimeError(
+                f"{func.__name__} draws for all learners together: they would not be independent."
+            )
+        return func(*args, **given)
+
+    def _fill(self, method: str, values: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        if values.shape[:1] != (len(self._generators),):
+            raise RuntimeError(
+                f"{method} draws a tensor {tuple(values.shape)} for all learners together: the first dimension must be "
+                f"that of the {len(self._generators)} learners."
+            )
+        for part, generator in zip(values, self._generators, strict=True):
+            getattr(part, method)(*args, generator=generator, **kwargs)
+        return values

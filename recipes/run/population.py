@@ -1,0 +1,198 @@
+"""Several learners that train together: a folder for each, as of a run of its own, and one for what they share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import ExitStack
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas
+
+import nht
+from nht.reading import entry, read_json
+from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.learners import check_alike
+from nht.recipes.run.metrics import FRAMES, TESTED
+from nht.recipes.run.ranks import Ranks
+from nht.recipes.sections import Training
+from nht.writing import replacing
+
+DIVERGED_FILE = "diverged.json"
+"""In the folder of a learner that was given up: after how many steps, and why."""
+
+Row = dict[str, float]
+
+
+def open_run(
+    configs: Sequence[Training], ranks: Ranks, together: str | None = None
+) -> RunFolder | PopulationFolder:
+    """The folder of a run of one learner, or those of several.
+
+    Args:
+        configs: of each learner; one that says ``seeds`` stands for as many.
+        ranks: the processes that learn together.
+        together: folder of what several learners share; None is the one that the first one's folder is in.
+
+    Raises:
+        ValueError: if several learners cannot share every call, or are to be shared among processes.
+        FileExistsError, FileNotFoundError: as ``RunFolder``.
+    """
+    if len(configs) == 1 and configs[0].seeds is not None:
+        together = configs[0].run.folder
+        configs = with_seeds(configs[0])
+    if len(configs) == 1:
+        return RunFolder(configs[0], ranks)
+    if ranks.size > 1:
+        raise ValueError(
+            f"{len(configs)} learners train in one process, got {ranks.size}: give each process seeds of its own."
+        )
+    return PopulationFolder(configs, ranks, Path(together or Path(configs[0].run.folder).parent))
+
+
+def with_seeds(config: Training) -> list[Training]:
+    """A configuration for each of ``seeds`` learners, of ``seed``, ``seed + 1`` ..., in folders beneath the run's."""
+    if config.seeds is None or config.seeds < 1:
+        raise ValueError(f"seeds must be at least 1, got {config.seeds}.")
+    base = Path(config.run.folder)
+    made = []
+    for seed in range(config.seed, config.seed + config.seeds):
+        run = replace(
+            config.run,
+            folder=str(base / f"seed-{seed}"),
+            wandb_group=config.run.wandb_group or base.name,
+        )
+        made.append(replace(deepcopy(config), seed=seed, seeds=None, run=run))
+    return made
+
+
+class PopulationFolder:
+    """The folders of several learners, to what calls it like that of one.
+
+    Args:
+        configs: of each learner, with folders of their own.
+        ranks: this process, alone.
+        path: of what the learners share: their checkpoints.
+
+    Raises:
+        ValueError: if they cannot share every call, or two have one folder.
+        FileExistsError, FileNotFoundError: as ``RunFolder``.
+
+    Attributes:
+        path: of what the learners share.
+        members: the learners' folders.
+        resuming: whether there is something to go on from.
+    """
+
+    def __init__(self, configs: Sequence[Training], ranks: Ranks, path: Path) -> None:
+        check_alike(configs)
+        folders = [config.run.folder for config in configs]
+        if len(set(folders)) < len(folders):
+            raise ValueError(f"every learner needs a folder of its own, got {sorted(folders)}.")
+        self.path = path
+        resume = configs[0].run.resume
+        if resume is True and not any(Path(folder).exists() for folder in folders):
+            raise FileNotFoundError(f"{path} holds no run to resume.")
+        self.members: list[RunFolder] = []
+        with ExitStack() as undo:
+            for config in configs:
+                run = replace(config.run, resume="auto" if resume is True else resume)
+                self.members.append(RunFolder(replace(config, run=run), ranks))
+                undo.callback(self.members[-1].close)
+            undo.pop_all()
+        self.resuming = any(member.resuming for member in self.members)
+
+    @property
+    def config(self) -> Training:
+        """What all learners have alike stands in the first one's."""
+        return self.members[0].config
+
+    @property
+    def configs(self) -> list[Training]:
+        """Of every learner."""
+        return [member.config for member in self.members]
+
+    @property
+    def maps(self) -> list[nht.ActionMap]:
+        """Of every learner."""
+        return [member.map for member in self.members]
+
+    @property
+    def whole(self) -> bool:
+        """Whether every learner got to its end, or was given up."""
+        return all(member.whole or diverged(member.path) is not None for member in self.members) and any(
+            member.whole for member in self.members
+        )
+
+    def log_each(self, frames: int, rows: Sequence[Row | FloatingPointError]) -> None:
+        """Append a row to every learner's metrics; one that diverged is noted, and gets no more.
+
+        Raises:
+            FloatingPointError: if all have diverged.
+        """
+        going_on = 0
+        for member, row in zip(self.members, rows, strict=True):
+            if diverged(member.path) is not None or member.whole:
+                going_on += member.whole
+            elif isinstance(row, FloatingPointError):
+                note = {FRAMES: frames, "reason": str(row)}
+                with replacing(member.path / DIVERGED_FILE) as scratch:
+                    scratch.write_text(json.dumps(note))
+            else:
+                member.log(frames, row)
+                going_on += 1
+        if not going_on:
+            raise FloatingPointError(
+                f"all {len(rows)} learners diverged; the first: {diverged(self.members[0].path)}"
+            )
+
+    def rewind(self, frames: int) -> None:
+        """Drop what was written behind ``frames``: it is written again."""
+        for member in self.members:
+            note = member.path / DIVERGED_FILE
+            if note.exists() and read_json(note).get(FRAMES, 0) > frames:
+                note.unlink()
+            if not member.whole:
+                member.rewind(frames)
+
+    def finished(self) -> list[tuple[int, RunFolder]]:
+        """The learners that got to the end, with their numbers, as far as they are not noted as whole yet."""
+        return [
+            (learner, member)
+            for learner, member in enumerate(self.members)
+            if diverged(member.path) is None and not member.whole
+        ]
+
+    def show(self) -> None:
+        """Say what happened to every learner and where the files are."""
+        rows = []
+        for member in self.members:
+            reason = diverged(member.path)
+            last = pandas.read_csv(member.metrics).iloc[-1] if member.metrics.exists() else {}
+            rows.append(
+                {"learner": member.path.name, **{name: last.get(name) for name in (FRAMES, *TESTED)}}
+                | ({"diverged": reason} if reason is not None else {})
+            )
+        print(pandas.DataFrame(rows).to_string(index=False))
+        print(f"\n{self.path}: {len(self.members)} learners, each in a folder of its own")
+
+    def close(self) -> None:
+        """Let go of all folders."""
+        for member in self.members:
+            member.close()
+
+
+def diverged(folder: Path) -> str | None:
+    """Why the learner of that folder was given up; None if it was not.
+
+    Raises:
+        ValueError: if the note cannot be read.
+    """
+    note = folder / DIVERGED_FILE
+    if not note.exists():
+        return None
+    record: dict[str, Any] = read_json(note)
+    return str(entry(record, "reason", str, str(note)))

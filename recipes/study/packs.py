@@ -1,0 +1,164 @@
+"""Runs of a search that train together: as one population of learners, in one process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from zlib import crc32
+
+from nht.reading import read_json
+from nht.recipes.agents.table import find_algorithm
+from nht.recipes.launch import configure
+from nht.recipes.maps.kinds import find_kind
+from nht.recipes.quiet import quiet_libraries
+from nht.recipes.run.ownership import OwnedError, claimed
+from nht.recipes.run.population import diverged
+from nht.recipes.study.jobs import Ending, Job, run_job
+
+
+@dataclass(frozen=True)
+class Pack:
+    """Runs whose learners are of one shape.
+
+    Attributes:
+        jobs: the runs, of one stage.
+    """
+
+    jobs: tuple[Job, ...]
+
+    @property
+    def name(self) -> str:
+        """Of the pack, by what is in it."""
+        if len(self.jobs) == 1:
+            return self.jobs[0].name
+        return f"packs/{self.jobs[0].stage}-{crc32(' '.join(job.name for job in self.jobs).encode()):08x}"
+
+    def halves(self) -> tuple[Pack, Pack]:
+        """Two packs of half as many."""
+        middle = len(self.jobs) // 2
+        return Pack(self.jobs[:middle]), Pack(self.jobs[middle:])
+
+
+def packed(jobs: Sequence[Job], learners: int) -> list[Pack]:
+    """All runs of a stage in packs of at most ``learners``; those of nearly the same batch size together.
+
+    Raises:
+        ValueError: if the algorithm trains one learner at a time.
+    """
+    varies = find_algorithm(jobs[0].recipe).schema().algo.varies
+    if learners > 1 and not varies:
+        raise ValueError(
+            f"search.learners={learners} needs an algorithm that trains several: {jobs[0].recipe} trains one."
+        )
+    alike: dict[str, list[Job]] = {}
+    for job in jobs:
+        alike.setdefault(_shape(job, varies), []).append(job)
+    packs = []
+    for members in alike.values():
+        members.sort(key=lambda job: float(job.parameters.get("algo.batch_size", 0)))  # little is filled up
+        packs += [Pack(tuple(members[at : at + learners])) for at in range(0, len(members), learners)]
+    return packs
+
+
+def _shape(job: Job, varies: Sequence[str]) -> str:
+    """Alike for runs whose learners can share every call."""
+    own = {f"algo.{name}" for name in varies}
+    shared = {
+        name: value
+        for name, value in job.parameters.items()
+        if name not in own and not name.startswith("map.")
+    }
+    kind = find_kind("none" if job.interface == "raw" else job.interface)
+    width = job.interface if kind.fixed_width else "as told"
+    frames = [word for word in job.overrides if word.startswith("algo.total_frames=")]
+    return json.dumps([job.recipe, job.env, job.stage, width, frames, shared], sort_keys=True)
+
+
+def run_pack(pack: Pack, folder: Path) -> None:
+    """Train the learners of a pack together, or go on where another process was stopped; outcomes are recorded.
+
+    Runs that have ended take no part. A pack that fails, for want of memory or because of one of its runs, is halved,
+    and both halves are trained: so one run that cannot be does not cost the others. A run that another process is at,
+    here or elsewhere, is left to it.
+
+    Args:
+        pack: what to run.
+        folder: of the search.
+    """
+    if len(pack.jobs) == 1:
+        run_job(pack.jobs[0], folder)
+        return
+    with claimed(folder / "claims" / pack.name.replace("/", "-")) as ours:
+        if not ours:
+            return
+        members = _members(pack, folder)
+        try:
+            if len(members) < 2:
+                raise _NotTogetherError
+            _train_together(members, folder, folder / pack.name)
+        except OwnedError:
+            return
+        except _NotTogetherError:
+            for half in (
+                Pack(tuple(members)).halves() if len(members) > 1 else [Pack((job,)) for job in members]
+            ):
+                run_pack(half, folder)
+        shutil.rmtree(folder / pack.name / "checkpoints", ignore_errors=True)  # buffers are large
+        (folder / pack.name / "members.json").unlink(missing_ok=True)
+
+
+class _NotTogetherError(Exception):
+    """These runs could not be trained together."""
+
+
+def _members(pack: Pack, folder: Path) -> list[Job]:
+    """The runs that train together: the same when the pack is taken up again, for its checkpoints are of these."""
+    note = folder / pack.name / "members.json"
+    if note.exists():
+        names = read_json(note).get("members", [])
+        return [job for job in pack.jobs if job.name in names]
+    members = [job for job in pack.jobs if Ending.read(folder / job.name) is None]
+    note.parent.mkdir(parents=True, exist_ok=True)
+    note.write_text(json.dumps({"members": [job.name for job in members]}))
+    return members
+
+
+def _train_together(jobs: Sequence[Job], folder: Path, together: Path) -> None:
+    algorithm = find_algorithm(jobs[0].recipe)
+    configs = [
+        configure(
+            algorithm.schema,
+            job.recipe,
+            [*job.overrides, f"run.folder={folder / job.name}", "run.resume=auto"],
+        )
+        for job in jobs
+    ]
+    begun = time.process_time()
+    reason = ""
+    with (
+        (together / "train.log").open("a") as log,
+        contextlib.redirect_stdout(log),
+        contextlib.redirect_stderr(log),
+    ):
+        quiet_libraries()
+        try:
+            algorithm.train(*configs, together=str(together))
+        except OwnedError:
+            raise
+        except FloatingPointError as error:  # every learner diverged, and that is noted; or a map did
+            reason = str(error)
+        except Exception as error:  # whatever it is, the runs may do better apart
+            print(f"{type(error).__name__}: {error}")
+            raise _NotTogetherError from error
+    if any(diverged(folder / job.name) is None for job in jobs) and reason:
+        raise _NotTogetherError
+    spent = (time.process_time() - begun) / len(jobs)
+    for job in jobs:
+        why = diverged(folder / job.name)
+        ending = Ending("done", "", spent) if why is None else Ending("diverged", why, spent)
+        ending.write(folder / job.name)

@@ -1,0 +1,83 @@
+"""A search that is killed, or whose workers are, goes on by the same command: every run as if nothing had happened.
+
+The number of searches is in the environment variable ``NHT_KILLED_RUNS``.
+"""
+
+import os
+import random
+
+import pandas
+import pytest
+from safetensors import safe_open
+
+import killed_searches
+
+RUNS = int(os.environ.get("NHT_KILLED_RUNS", "1"))
+FIRST = int(os.environ.get("NHT_KILLED_RUNS_FIRST", "0"))
+BASE = [
+    "env.num_envs=4",
+    "env.options.max_episode_steps=25",
+    "algo.frames_per_batch=100",
+    "algo.hidden=[16,16]",
+    "algo.updates_per_batch=3",
+    "algo.warmup_frames=0",
+    "evaluation.every=400",
+    "evaluation.episodes=2",
+    "evaluation.video=false",
+    "run.checkpoint_every=200",
+    "run.wandb=false",
+    "map.max_steps=100",
+]
+SETTINGS = [
+    "search=smoke",
+    "search.interfaces=[nht,raw]",
+    "search.configs=1",
+    "search.best_seeds=0",
+    "search.total_frames=1200",
+    f"search.base={BASE}",
+    "demos.transitions=500",
+]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A search that nothing disturbed, and its duration in seconds."""
+    folder = tmp_path_factory.mktemp("whole") / "search"
+    return folder, killed_searches.finish(folder, SETTINGS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(FIRST, FIRST + RUNS))
+def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path, record_property):
+    undisturbed, seconds = whole
+    draw, folder = random.Random(f"search {number}"), tmp_path / "search"
+    attacks = [
+        (draw.uniform(0, seconds), draw.choice(["search", "worker"])) for _ in range(draw.randint(1, 3))
+    ]
+    kills = [killed_searches.kill_after(time, victim, folder, SETTINGS) for time, victim in attacks]
+    record_property("kills", sum(kills))
+    print(f"search {number}: (time, victim) {attacks} of {seconds:.1f} s: {kills}")
+    killed_searches.finish(folder, SETTINGS)
+    rows = [rows_of(path) for path in (folder, undisturbed)]
+    pandas.testing.assert_frame_equal(*rows)
+    assert set(rows[0]["status"]) == {"done"}
+    for run in undisturbed.glob("search/*/*"):
+        mended = folder / run.relative_to(undisturbed)
+        for name in ("policy.safetensors", "whole.json", "outcome.json"):
+            assert (mended / name).read_bytes() == (run / name).read_bytes(), mended / name
+        assert header(mended / "map.safetensors") == header(run / "map.safetensors")
+    assert names(folder) == names(undisturbed)  # nothing is left lying about
+
+
+def header(file):
+    """With a checksum over all weights; its entries stand in an order that differs between processes."""
+    with safe_open(file, framework="pt") as opened:
+        return opened.metadata()
+
+
+def rows_of(folder):
+    return pandas.read_csv(folder / "rows.csv", keep_default_na=False).drop(columns="seconds")
+
+
+def names(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
