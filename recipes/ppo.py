@@ -45,7 +45,7 @@ def main(*configs: PPO, together: str | None = None) -> None:
     policy = TensorDictSequential(features, actor)
     possible = reward_range(envs.train)
     rewards = ReturnNorm(envs.copies, algo.gamma, algo.reward_clip, learners=learners.count).to(ranks.device)
-    gae = advantage_estimator(algo.gamma, algo.lmbda, learners.count)
+    gae = advantage_estimator(algo.gamma, algo.lmbda)
     loss = GaussianPPOLoss(
         actor,
         critic,

@@ -258,17 +258,12 @@ class GaussianPPOLoss(ClipPPOLoss):
         return error.squeeze(-1).mean(-1)
 
 
-def advantage_estimator(
-    gamma: Setting, lmbda: Setting, learners: int | None = None
-) -> Callable[[TensorDictBase], TensorDictBase]:
-    """TorchRL's ``GAE``, which writes into steps ``(*batch, T)``; of several learners, one for each.
-
-    It pads episodes to the longest: in one call for all, how others' episodes end would reach a learner's last digits.
-    """
-    if learners is None:
+def advantage_estimator(gamma: Setting, lmbda: Setting) -> Callable[[TensorDictBase], TensorDictBase]:
+    """TorchRL's ``GAE``, which writes into steps ``(*batch, T)``; with numbers of its own for each learner, if told."""
+    if not isinstance(gamma, Tensor) and not isinstance(lmbda, Tensor):
         return GAE(gamma=gamma, lmbda=lmbda, value_network=None)
-    numbers = [torch.as_tensor(number).expand(learners).tolist() for number in (gamma, lmbda)]
-    own = [GAE(gamma=one, lmbda=other, value_network=None) for one, other in zip(*numbers, strict=True)]
+    numbers = zip(*torch.broadcast_tensors(torch.as_tensor(gamma), torch.as_tensor(lmbda)), strict=True)
+    own = [GAE(gamma=float(one), lmbda=float(other), value_network=None) for one, other in numbers]
     return lambda data: torch.stack([gae(part) for gae, part in zip(own, data, strict=True)])
 
 

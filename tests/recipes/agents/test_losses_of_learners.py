@@ -261,7 +261,7 @@ def test_advantages(gamma, lmbda):
     data["next", "done"][..., 4, :] = True
     data["next", "terminated"][:, 1, 4] = True
     data["state_value"], data["next", "state_value"] = torch.randn(*rows, 1), torch.randn(*rows, 1)
-    found = advantage_estimator(gamma, lmbda, LEARNERS)(data.clone())
+    found = advantage_estimator(gamma, lmbda)(data.clone())
     for learner in range(LEARNERS):
         told = of({"gamma": gamma, "lmbda": lmbda}, learner)
         expected = advantage_estimator(**told)(data[learner].clone())

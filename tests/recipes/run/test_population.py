@@ -48,7 +48,7 @@ def test_a_population_is_as_many_runs(algorithm, tmp_path, monkeypatch):
                 together[loss][:10, learner],
                 values[:10],
                 rtol=1e-5,
-                atol=1e-6,
+                atol=1e-5,  # ppo's objective is a mean about 0 of terms about 1
                 msg=lambda text, n=loss: f"{n}: {text}",
             )
         FRAME(found[name], expected, rtol=1e-3, atol=1e-3)
@@ -56,6 +56,7 @@ def test_a_population_is_as_many_runs(algorithm, tmp_path, monkeypatch):
         assert not torch.equal(values[:, 0], values[:, 1]), loss
 
 
+@pytest.mark.slow
 def test_seeds_are_as_many_runs(algorithm, tmp_path, capsys):
     told = ["seed=4", "seeds=3", *MORE[algorithm]]
     MAINS[algorithm](populations.config(algorithm, tmp_path / "together", *told))
@@ -79,6 +80,7 @@ def test_seeds_are_as_many_runs(algorithm, tmp_path, capsys):
     assert (tmp_path / "together" / "checkpoints").is_dir()
 
 
+@pytest.mark.slow
 def test_one_seed_is_a_run(algorithm, tmp_path):
     MAINS[algorithm](populations.config(algorithm, tmp_path / "one", "seed=4", "seeds=1"))
     alone = populations.train(algorithm, tmp_path / "alone", {"own": ["seed=4"]})["own"]
@@ -86,6 +88,7 @@ def test_one_seed_is_a_run(algorithm, tmp_path):
     assert same_policy(tmp_path / "one" / "seed-4", tmp_path / "alone" / "own")
 
 
+@pytest.mark.slow
 def test_who_is_beside_a_learner_does_not_matter(algorithm, tmp_path):
     few = populations.train(algorithm, tmp_path / "few", of(algorithm, "ab"))
     many = populations.train(
@@ -100,10 +103,10 @@ def test_beside_others_of_the_same_settings_it_is_the_same_bit_for_bit(algorithm
 
     few = populations.train(algorithm, tmp_path / "few", seeds(1, 2))
     many = populations.train(algorithm, tmp_path / "many", seeds(1, 7, 8))
-    FRAME(many["1"], few["1"], rtol=1e-6, atol=1e-7)
+    FRAME(many["1"], few["1"], check_exact=True)
 
 
-@pytest.mark.parametrize("where", [200, 300])
+@pytest.mark.parametrize("where", [pytest.param(200, marks=pytest.mark.slow), 300])
 def test_stopped_it_goes_on_as_if_it_had_not_been(algorithm, where, tmp_path, monkeypatch):
     learners = of(algorithm, "abc", "algo.total_frames=400")
     whole = populations.train(algorithm, tmp_path / "whole", learners)
@@ -116,6 +119,7 @@ def test_stopped_it_goes_on_as_if_it_had_not_been(algorithm, where, tmp_path, mo
         assert same_policy(tmp_path / "stopped" / name, tmp_path / "whole" / name)
 
 
+@pytest.mark.slow
 def test_whole_it_is_left_as_it_is(algorithm, tmp_path, capsys):
     learners = of(algorithm, "ab")
     populations.train(algorithm, tmp_path / "run", learners)
@@ -161,6 +165,7 @@ def test_a_learner_that_diverges_harms_no_other(algorithm, tmp_path, capsys):
         assert (tmp_path / "lost" / name / "policy.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_a_map_that_gives_no_numbers_harms_no_other(algorithm, tmp_path):
     lost = populations.Lost(10, 7, 2)
     lost.context_keys = ("tool_position", "joint_angle")
@@ -178,7 +183,7 @@ def test_a_map_that_gives_no_numbers_harms_no_other(algorithm, tmp_path):
     sound = populations.train(
         algorithm,
         tmp_path / "sound",
-        learners("map=nht", f"map.file={populations.map_of(tmp_path / 'maps', 1)}"),
+        learners("map=nht", f"map.file={other}"),
     )
     configs = learners(*told)
     MAINS[algorithm](
@@ -192,6 +197,7 @@ def test_a_map_that_gives_no_numbers_harms_no_other(algorithm, tmp_path):
         FRAME(populations.metrics(tmp_path / "run" / name), sound[name])
 
 
+@pytest.mark.slow
 def test_all_of_them_diverge(algorithm, tmp_path):
     learners = {
         name: [f"seed={seed}", *MORE[algorithm], f"algo.{RATE[algorithm]}=1e30", "algo.total_frames=400"]
@@ -202,6 +208,7 @@ def test_all_of_them_diverge(algorithm, tmp_path):
     assert (tmp_path / "run" / "a" / DIVERGED_FILE).exists()
 
 
+@pytest.mark.slow
 def test_a_diverged_learner_stays_so_when_the_others_go_on(algorithm, tmp_path, monkeypatch):
     learners = of(algorithm, "abc", "algo.total_frames=400")
     learners["b"].append(f"algo.{RATE[algorithm]}=1e30")
@@ -224,6 +231,7 @@ def test_a_diverged_learner_stays_so_when_the_others_go_on(algorithm, tmp_path, 
     run(tmp_path / "stopped")  # it is whole
 
 
+@pytest.mark.slow
 def test_the_last_evaluation_may_have_more_episodes(algorithm, tmp_path, monkeypatch):
     from nht.recipes.run import record
 
