@@ -42,17 +42,18 @@ class Draws:
 
     def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
         self.generators = [Generator(device).manual_seed(seed) for seed in seeds]
+        self._torch: Any = torch if device.type == "cpu" else torch.cuda  # who draws when nobody is named
 
     @contextmanager
     def of(self, learner: int) -> Iterator[None]:
-        """Within, torch itself draws from the generator of one learner; on the CPU."""
-        generator, before = self.generators[learner], torch.get_rng_state()
-        torch.set_rng_state(generator.get_state())
+        """Within, torch itself draws from the generator of one learner."""
+        generator, before = self.generators[learner], self._torch.get_rng_state()
+        self._torch.set_rng_state(generator.get_state())
         try:
             yield
         finally:
-            generator.set_state(torch.get_rng_state())
-            torch.set_rng_state(before)
+            generator.set_state(self._torch.get_rng_state())
+            self._torch.set_rng_state(before)
 
     @contextmanager
     def for_all(self) -> Iterator[None]:
@@ -62,10 +63,10 @@ class Draws:
             RuntimeError: there, for a draw that has no part for each learner; at the end, if something drew from torch
                 itself all the same, unseen within a function of torch's.
         """
-        before = torch.get_rng_state()
+        before = self._torch.get_rng_state()
         with _LearnerByLearner(self.generators):
             yield
-        if not torch.equal(torch.get_rng_state(), before):
+        if not torch.equal(self._torch.get_rng_state(), before):
             raise RuntimeError(
                 "something drew from torch's own generator for all learners together: they would not be independent."
             )
