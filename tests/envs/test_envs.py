@@ -277,8 +277,8 @@ def test_returned_arrays_belong_to_the_caller(name):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_an_action_that_is_not_finite_fails_its_copy_only(name, value, monkeypatch):
-    monkeypatch.setattr(mujoco_log, "_told", told := set())
     env, healthy = make_env(name, num_envs=3, seed=0), make_env(name, num_envs=3, seed=0)
+    monkeypatch.setattr(mujoco_log, "_told", told := set())  # models may be warned of when they are compiled
     actions = random_actions(env, 6)
     expected = play(healthy, actions)
     actions[2, 1, -1] = value

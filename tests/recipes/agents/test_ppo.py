@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pandas
 import pytest
-import torch
 
 import nht
 import nht.envs
 from nht.recipes import ddpg, evaluate, ppo
+from nht.recipes.agents.adam import LearnersAdam
 from nht.recipes.agents.ppo import GaussianPPOLoss
 from nht.recipes.config import DDPG, PPO, Evaluate
 from nht.recipes.launch import configure
@@ -89,13 +89,13 @@ def test_a_run_that_broke_off_resumes_as_if_it_had_not(run, tmp_path, monkeypatc
 
 def test_the_learning_rate_falls_linearly(tmp_path, monkeypatch):
     rates = []
-    step = torch.optim.Adam.step
+    step = LearnersAdam.step
 
     def record(self, *args, **kwargs):
         rates.append(self.param_groups[0]["lr"])
         return step(self, *args, **kwargs)
 
-    monkeypatch.setattr(torch.optim.Adam, "step", record)
+    monkeypatch.setattr(LearnersAdam, "step", record)
     train(tmp_path / "falling", "algo.learning_rate=0.4", "algo.epochs=1")
     assert rates[::4] == pytest.approx([0.4, 0.3, 0.2, 0.1])
     rates.clear()
