@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 Record = TypeVar("Record")
+
+
+@cache
+def installed(group: str) -> dict[str, EntryPoint]:
+    """The entry points of installed packages by name, looked for once: all packages' files are read for it."""
+    return {found.name: found for found in entry_points(group=group)}
 
 
 class Table(Mapping[str, Record]):
@@ -62,7 +69,7 @@ class Table(Mapping[str, Record]):
         return None if isinstance(found, str) else found
 
     def _installed(self) -> dict[str, EntryPoint]:
-        return {found.name: found for found in entry_points(group=self.group)}
+        return installed(self.group)
 
     def __iter__(self) -> Iterator[str]:
         """All names, ours first; import paths are endless and left out."""

@@ -31,7 +31,7 @@ Config = TypeVar("Config")
 
 NAMED: dict[str, Table[Any]] = {"env": TASKS, "map": KINDS}
 """Groups whose choices need no YAML: what the table has, ``env=my_package.tasks:Pour``, is a choice, too."""
-EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, RuntimeError)
+EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, MemoryError, RuntimeError)
 """Errors that say by themselves what is wrong; HYDRA_FULL_ERROR=1 shows where they come from."""
 
 PATIENCE, TURN = 10.0, 2.0

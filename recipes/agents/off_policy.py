@@ -140,7 +140,8 @@ def _minibatches_of_each(
     learners, width = len(sizes), max(sizes)
     rows = buffer.storage[: len(buffer)].reshape(-1)  # of all learners, in turn
     drawn = draws.integers(len(buffer), [updates * size for size in sizes])
-    places = torch.zeros(updates, learners, width, dtype=torch.long, device=device)
+    # What fills a minibatch up is a learner's own step: a weight of 0 makes nothing of another's NaN.
+    places = torch.arange(learners, device=device).view(1, -1, 1).repeat(updates, 1, width)
     for learner, (size, own) in enumerate(zip(sizes, drawn, strict=True)):
         places[:, learner, :size] = own.view(updates, size) * learners + learner
     counts = torch.tensor(sizes, device=device).unsqueeze(-1)
@@ -172,12 +173,17 @@ def descend(losses: Sequence[Tensor], optimiser: torch.optim.Optimizer, ranks: R
 class Exploration(Protocol):
     """Settings of the noise that an algorithm explores with."""
 
-    exploration_noise: Setting
-    """Standard deviation; actions lie in [-1, 1]."""
-    noise_memory: Setting
-    """Steps after which the noise has forgotten itself; 1 is white noise."""
-    random_action: Setting
-    """Probability of a uniform action instead."""
+    @property
+    def exploration_noise(self) -> Setting:
+        """Standard deviation; actions lie in [-1, 1]."""
+
+    @property
+    def noise_memory(self) -> Setting:
+        """Steps after which the noise has forgotten itself; 1 is white noise."""
+
+    @property
+    def random_action(self) -> Setting:
+        """Probability of a uniform action instead."""
 
 
 def exploring(policy: TensorDictModule, env: EnvBase, algo: Exploration) -> TensorDictSequential:

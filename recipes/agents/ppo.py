@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -226,7 +226,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         log_prob, entropy = self.actor_network.module.log_prob(features, batch["sample"])
         log_ratio = log_prob - batch["sample_log_prob"]
         ratio = log_ratio.exp()
-        clip = beside(self._clip, ratio)
+        clip: Any = beside(self._clip, ratio)
         clipped = torch.clamp(ratio, 1.0 - clip, 1.0 + clip)
         advantage = self._normalised(batch["advantage"].squeeze(-1))
         objective = -torch.minimum(ratio * advantage, clipped * advantage).mean(-1)
@@ -251,7 +251,8 @@ class GaussianPPOLoss(ClipPPOLoss):
         target = batch["value_target"]
         error = (value - target).square()
         if self._clips_value:
-            old, clip = batch["state_value"], beside(self._clip, target)
+            old = batch["state_value"]
+            clip: Any = beside(self._clip, target)
             held = old + torch.clamp(value - old, -clip, clip)
             error = torch.maximum(error, (held - target).square())
         return error.squeeze(-1).mean(-1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import overload
 
 import torch
 from tensordict import TensorDictBase
@@ -25,6 +26,10 @@ def reward_range(env: EnvBase) -> Range:
     return found
 
 
+@overload
+def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> Range: ...
+@overload
+def return_range(reward_range: Range, gamma: Setting, steps: float = math.inf) -> tuple[Setting, Setting]: ...
 def return_range(reward_range: Range, gamma: Setting, steps: float = math.inf) -> tuple[Setting, Setting]:
     """The lowest and the highest discounted return that such rewards can add up to, over no step to ``steps``."""
     if isinstance(gamma, Tensor):

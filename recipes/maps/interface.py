@@ -161,3 +161,22 @@ def run_map(settings: Training, motors: int) -> nht.MapTraining:
     if map.kind == "none" and map.residual is None and default_scale(map) is not None:
         return nht.MapTraining(_configured(nht.Identity(motors), map), {})
     return train_map(map, env, settings.demos, settings.seed)
+
+
+def number_of_actions(settings: Training, motors: int, context_dim: int) -> int:
+    """How many actions the map has that a run is told to use, before it is trained.
+
+    Args:
+        settings: of the run.
+        motors: n, of the task.
+        context_dim: width of what the map sees there.
+
+    Raises:
+        FileNotFoundError, ValueError: if the given file holds no map or one of another kind, or for options that the
+            kind does not have.
+    """
+    map = settings.map
+    if map.file is not None:
+        return load_kind(map).action_dim
+    width = make_map(map, context_dim, motors, settings.seed, settings.env).action_dim
+    return width if map.residual is None else width + motors

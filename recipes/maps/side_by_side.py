@@ -73,7 +73,7 @@ class MapsSideBySide(nht.ActionMap):
 
     def _each(self, method: str, *rows: Any) -> Tensor:
         if self._groups is None:
-            self._groups = grouped(self.maps)
+            self._groups = grouped(list(self.maps))
         values, context, *limits = rows
         results: list[Tensor | None] = [None] * len(self.maps)
         for places, map, parameters, buffers in self._groups:

@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
@@ -30,12 +31,13 @@ class Checkpoints:
         folder: where they are.
         parts: what a run goes on from, each with a ``state_dict`` and a ``load_state_dict``, or a replay buffer; the
             generators of torch, NumPy and Python are added.
+        learners: whose networks are stacked, if several: one that is lost does not keep the others from going on.
     """
 
-    def __init__(self, folder: Path, **parts: Any) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, *, learners: int | None = None, **parts: Any) -> None:
+        self._folder, self._learners = folder, learners
         self._parts = {
-            name: BufferState(part) if isinstance(part, ReplayBuffer) else part
+            name: BufferState(part, learners) if isinstance(part, ReplayBuffer) else part
             for name, part in {**parts, "random": GlobalRNGState()}.items()
         }
 
@@ -98,7 +100,7 @@ class Checkpoints:
             raise ValueError(f"{path} lacks the parts {missing}, it has {shown(sorted(states))}.")
         for name, part in self._parts.items():
             if isinstance(part, nn.Module):
-                check_finite(states[name], part.state_dict(), f"{path}, {name!r}")
+                check_finite(states[name], part.state_dict(), f"{path}, {name!r}", self._learners)
         for name, part in sorted(self._parts.items()):
             try:
                 part.load_state_dict(states[name])
@@ -113,12 +115,19 @@ class Checkpoints:
                 raise ValueError(f"{path}, {name!r} does not fit this run: {shortened(error)}.") from error
 
 
-def check_finite(saved: Any, own: dict[str, Any], where: str) -> None:
+def check_finite(saved: Any, own: dict[str, Any], where: str, learners: int | None = None) -> None:
     """Check that the numbers of a network are finite, those aside that are the same in the network as it is built.
+
+    Args:
+        saved: the network's state.
+        own: that of the network as it is built.
+        where: they come from, for the message.
+        learners: whose networks are stacked in it, if several: then some of them may be lost, but not all.
 
     Raises:
         ValueError: if there are others.
     """
+    lost = torch.zeros(learners or 1, dtype=torch.bool)
     for name, value in saved.items() if isinstance(saved, dict) else ():
         if not isinstance(value, Tensor) or not value.is_floating_point():
             continue
@@ -126,7 +135,9 @@ def check_finite(saved: Any, own: dict[str, Any], where: str) -> None:
         known = own.get(name)
         if isinstance(known, Tensor) and known.shape == value.shape:
             wrong &= value.to(known.device) != known
-        if wrong.any():
+        stacked = learners is not None and value.shape[:1] == (learners,)
+        lost |= wrong.reshape(len(lost), -1).any(1).cpu() if stacked else wrong.any().cpu()
+        if lost.all():
             raise ValueError(
                 f"{where}: {name} holds {int(wrong.sum())} NaN or infinite values: training had diverged."
             )
@@ -144,10 +155,16 @@ def _is_whole(path: Path) -> bool:
 
 
 class BufferState:
-    """What a replay buffer holds, as a state dictionary: its rows as far as it is filled, and where it writes next."""
+    """What a replay buffer holds, as a state dictionary: its rows as far as it is filled, and where it writes next.
 
-    def __init__(self, buffer: ReplayBuffer) -> None:
+    Args:
+        buffer: of rows ``()``.
+        learners: a step of each of whom a row is, ``(learners,)``, if there are several.
+    """
+
+    def __init__(self, buffer: ReplayBuffer, learners: int | None = None) -> None:
         self._buffer = buffer
+        self._row = [] if learners is None else [learners]
 
     def state_dict(self) -> dict[str, Any]:
         """Rows ``(len(buffer),)`` by key, not copied; the state of writer and sampler."""
@@ -171,7 +188,9 @@ class BufferState:
             length = _length(rows)
             if length > storage.max_size:
                 raise ValueError(f"it holds {length} rows, the buffer has room for {storage.max_size}.")
-            storage.set(range(length), TensorDict(rows, batch_size=[length], device=storage.device))
+            storage.set(
+                range(length), TensorDict(rows, batch_size=[length, *self._row], device=storage.device)
+            )
         self._buffer.writer.load_state_dict(saved["writer"])
         if saved.get("sampler"):
             self._buffer.sampler.load_state_dict(saved["sampler"])

@@ -42,25 +42,34 @@ class Draws:
 
     def __init__(self, seeds: Sequence[int], device: torch.device) -> None:
         self.generators = [Generator(device).manual_seed(seed) for seed in seeds]
+        self._torch: Any = torch if device.type == "cpu" else torch.cuda  # who draws when nobody is named
 
     @contextmanager
     def of(self, learner: int) -> Iterator[None]:
-        """Within, torch itself draws from the generator of one learner; on the CPU."""
-        generator, before = self.generators[learner], torch.get_rng_state()
-        torch.set_rng_state(generator.get_state())
+        """Within, torch itself draws from the generator of one learner."""
+        generator, before = self.generators[learner], self._torch.get_rng_state()
+        self._torch.set_rng_state(generator.get_state())
         try:
             yield
         finally:
-            generator.set_state(torch.get_rng_state())
-            torch.set_rng_state(before)
+            generator.set_state(self._torch.get_rng_state())
+            self._torch.set_rng_state(before)
 
-    def for_all(self) -> TorchFunctionMode:
+    @contextmanager
+    def for_all(self) -> Iterator[None]:
         """Within, normal and uniform tensors ``(L, ...)`` are drawn learner by learner, each from its own generator.
 
         Raises:
-            RuntimeError: there, for a draw that has no part for each learner.
+            RuntimeError: there, for a draw that has no part for each learner; at the end, if something drew from torch
+                itself all the same, unseen within a function of torch's.
         """
-        return _LearnerByLearner(self.generators)
+        before = self._torch.get_rng_state()
+        with _LearnerByLearner(self.generators):
+            yield
+        if not torch.equal(self._torch.get_rng_state(), before):
+            raise RuntimeError(
+                "something drew from torch's own generator for all learners together: they would not be independent."
+            )
 
     def integers(self, high: int, counts: Sequence[int]) -> list[Tensor]:
         """For each learner its number of integers below ``high``."""
@@ -100,25 +109,33 @@ class _LearnerByLearner(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        given = kwargs or {}
+        given = dict(kwargs or {})
+        if given.get("generator") is not None:
+            return func(*args, **given)  # one learner's own
         if func in IN_PLACE:
             return self._fill(IN_PLACE[func], *args, **given)
         if func in LIKE:
             return self._fill(LIKE[func], torch.empty_like(*args, **given))
         if func in FRESH:
-            return self._fill(FRESH[func], torch.empty(*args, **given))
+            generator = given.pop("generator", None)
+            return self._fill(FRESH[func], torch.empty(*args, **given), generator=generator)
         if func in OTHERS:
             raise RuntimeError(
                 f"{func.__name__} draws for all learners together: they would not be independent."
             )
         return func(*args, **given)
 
-    def _fill(self, method: str, values: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    def _fill(
+        self, method: str, values: Tensor, *args: Any, generator: Generator | None = None, **kwargs: Any
+    ) -> Tensor:
+        if generator is not None:  # whoever brings one knows whose it is
+            filled: Tensor = getattr(values, method)(*args, generator=generator, **kwargs)
+            return filled
         if values.shape[:1] != (len(self._generators),):
             raise RuntimeError(
                 f"{method} draws a tensor {tuple(values.shape)} for all learners together: the first dimension must be "
                 f"that of the {len(self._generators)} learners."
             )
-        for part, generator in zip(values, self._generators, strict=True):
-            getattr(part, method)(*args, generator=generator, **kwargs)
+        for part, own in zip(values, self._generators, strict=True):
+            getattr(part, method)(*args, generator=own, **kwargs)
         return values

@@ -59,6 +59,11 @@ class RunFolder:
     """
 
     def __init__(self, config: Training, ranks: Ranks) -> None:
+        if config.seeds is not None:
+            raise ValueError(
+                f"{name_of(type(config))} trains one learner at a time: ddpg and ppo train several together, got "
+                f"seeds={config.seeds}."
+            )
         self.path = Path(config.run.folder)
         self.config = resolved(config)
         self.metrics = self.path / METRICS_FILE

@@ -9,7 +9,8 @@ from dataclasses import asdict
 from typing import Any, Generic, TypeVar
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from nht.recipes.agents.settings import Setting
@@ -64,8 +65,12 @@ class Learners(Generic[Config]):
                 made.append(make(config.algo))
         return tuple(stacked(kind) for kind in zip(*made, strict=True))
 
-    def exploring(self) -> AbstractContextManager[Any]:
-        """Within, what policies draw is drawn learner by learner."""
+    def exploring(self, policy: TensorDictModuleBase) -> TensorDictModuleBase:
+        """The policy whose draws are each learner's own."""
+        return policy if self.draws is None else ExploringApart(policy, self.draws)
+
+    def drawing(self) -> AbstractContextManager[Any]:
+        """Within, whatever is drawn is drawn learner by learner."""
         return nullcontext() if self.draws is None else self.draws.for_all()
 
     def each(self, setting: Setting) -> Any:
@@ -73,6 +78,24 @@ class Learners(Generic[Config]):
         if self.count is None:
             return setting
         return setting.tolist() if isinstance(setting, Tensor) else self.count * [setting]
+
+
+class ExploringApart(TensorDictSequential):
+    """A policy of several learners, each of which draws from its own generator.
+
+    Args:
+        policy: of all.
+        draws: their generators.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, draws: Draws) -> None:
+        super().__init__(policy)
+        self._draws = draws
+
+    def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
+        """What the policy does."""
+        with self._draws.for_all():
+            return super().forward(tensordict, *args, **kwargs)
 
 
 def check_alike(configs: Sequence[Training]) -> None:

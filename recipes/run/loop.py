@@ -77,12 +77,14 @@ class Loop:
         self._signal: int | None = None
         self._told_at = 0.0  # by the clock that never goes back [s]
         ranks.part_ways(envs.seed)  # the networks are made, alike in all processes; exploration differs
-        with self._exploring():  # a collector tries the policy
+        self._random_frames = random_frames
+        acting = policy if learners is None else learners.exploring(policy)
+        with self._drawing():  # a collector tries environment and policy
             self.collector: BaseCollector = make_collector(
                 config.collector,
                 envs.train,
                 envs.make,
-                policy,
+                acting,
                 frames_per_batch=many * ranks.share("algo.frames_per_batch", config.algo.frames_per_batch),
                 seed=envs.seed,
                 random_frames=many * random_frames // ranks.size,
@@ -99,6 +101,7 @@ class Loop:
             )
         self._checkpoints = Checkpoints(
             folder.path / "checkpoints" / ranks.folder,
+            learners=None if learners is None else learners.count,
             loss=loss,
             **parts,
             collector=CollectorState(self.collector, envs.seed, exact=simulation.can_resume),
@@ -168,7 +171,8 @@ class Loop:
         if self._alone:
             batches = iter(self.collector)
             while not self._record.finished:
-                with self._exploring():
+                random = self._record.frames < self._random_frames  # the collector itself draws actions then
+                with self._drawing() if random else nullcontext():
                     batch = next(batches)
                 yield batch
                 self._save_if_due()
@@ -182,9 +186,9 @@ class Loop:
                 workers.update(self._policy)
             self._save_if_due()
 
-    def _exploring(self) -> AbstractContextManager[Any]:
+    def _drawing(self) -> AbstractContextManager[Any]:
         """Within, every learner draws from its own generator."""
-        return nullcontext() if self._learners is None else self._learners.exploring()
+        return nullcontext() if self._learners is None else self._learners.drawing()
 
     @contextmanager
     def _saving(self) -> Iterator[None]:

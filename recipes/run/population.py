@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import deepcopy
@@ -14,8 +15,13 @@ import pandas
 
 import nht
 from nht.reading import entry, read_json
+from nht.recipes.maps.interface import number_of_actions
+from nht.recipes.maps.kinds import map_context_keys
+from nht.recipes.maps.side_by_side import MapsSideBySide
+from nht.recipes.run.environments import base_env
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.learners import check_alike
+from nht.recipes.run.memory import check_memory
 from nht.recipes.run.metrics import FRAMES, TESTED
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import Training
@@ -46,6 +52,11 @@ def open_run(
         configs = with_seeds(configs[0])
     if len(configs) == 1:
         return RunFolder(configs[0], ranks)
+    for learner, config in enumerate(configs):
+        if config.seeds is not None:
+            raise ValueError(
+                f"learner {learner} says seeds={config.seeds}: that is for a configuration alone."
+            )
     if ranks.size > 1:
         raise ValueError(
             f"{len(configs)} learners train in one process, got {ranks.size}: give each process seeds of its own."
@@ -78,7 +89,8 @@ class PopulationFolder:
         path: of what the learners share: their checkpoints.
 
     Raises:
-        ValueError: if they cannot share every call, or two have one folder.
+        ValueError: if they cannot share every call, or two have one folder. New folders are taken away again then.
+        MemoryError: if their replay buffers do not fit; says how many would.
         FileExistsError, FileNotFoundError: as ``RunFolder``.
 
     Attributes:
@@ -92,16 +104,23 @@ class PopulationFolder:
         folders = [config.run.folder for config in configs]
         if len(set(folders)) < len(folders):
             raise ValueError(f"every learner needs a folder of its own, got {sorted(folders)}.")
+        check_memory(configs)
         self.path = path
         resume = configs[0].run.resume
         if resume is True and not any(Path(folder).exists() for folder in folders):
             raise FileNotFoundError(f"{path} holds no run to resume.")
+        if not any(Path(folder).exists() for folder in folders):
+            check_actions(configs)
         self.members: list[RunFolder] = []
         with ExitStack() as undo:
             for config in configs:
                 run = replace(config.run, resume="auto" if resume is True else resume)
+                fresh = not Path(run.folder).exists()
                 self.members.append(RunFolder(replace(config, run=run), ranks))
+                if fresh:
+                    undo.callback(shutil.rmtree, run.folder, ignore_errors=True)
                 undo.callback(self.members[-1].close)
+            MapsSideBySide(self.maps)  # whether they go together
             undo.pop_all()
         self.resuming = any(member.resuming for member in self.members)
 
@@ -171,18 +190,43 @@ class PopulationFolder:
         rows = []
         for member in self.members:
             reason = diverged(member.path)
-            last = pandas.read_csv(member.metrics).iloc[-1] if member.metrics.exists() else {}
+            last: Any = pandas.read_csv(member.metrics).iloc[-1] if member.metrics.exists() else {}
             rows.append(
-                {"learner": member.path.name, **{name: last.get(name) for name in (FRAMES, *TESTED)}}
+                {"learner": self._named(member), **{name: last.get(name) for name in (FRAMES, *TESTED)}}
                 | ({"diverged": reason} if reason is not None else {})
             )
         print(pandas.DataFrame(rows).to_string(index=False))
         print(f"\n{self.path}: {len(self.members)} learners, each in a folder of its own")
 
+    def _named(self, member: RunFolder) -> str:
+        inside = member.path.is_relative_to(self.path)
+        return str(member.path.relative_to(self.path) if inside else Path(*member.path.parts[-2:]))
+
     def close(self) -> None:
         """Let go of all folders."""
         for member in self.members:
             member.close()
+
+
+def check_actions(configs: Sequence[Training]) -> None:
+    """Check that the learners' policies have as many actions, before any of their maps is trained.
+
+    Raises:
+        FileNotFoundError, ValueError: if not; names the learner. As ``number_of_actions``, if a map cannot be made.
+    """
+    env = base_env(configs[0].env, seed=0, num_envs=1)
+    motors, seen = env.action_spec.shape[-1], env.observation_spec
+    env.close()
+    first = None
+    for learner, config in enumerate(configs):
+        keys = [key for key in map_context_keys(config.map, config.env) if key in seen.keys(True, True)]
+        count = number_of_actions(config, motors, sum(seen[key].shape[-1] for key in keys))
+        first = count if first is None else first
+        if count != first:
+            raise ValueError(
+                f"learners of one population share action_dim: the map of learner 0 has {first}, that of learner "
+                f"{learner} has {count}."
+            )
 
 
 def diverged(folder: Path) -> str | None:

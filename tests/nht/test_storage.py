@@ -17,8 +17,8 @@ from torch import Tensor
 
 import nht
 from nht.maps import ActionMap
-from nht.replacing import replacing
 from nht.storage import _checksum, load_map, save_map
+from nht.writing import replacing
 
 KEYS = ("tool_position", ("arm", "joint_angle"))
 
@@ -251,7 +251,7 @@ def test_files_that_do_not_fit_are_refused(path: Path, change: dict[str, Any], m
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from nht.replacing import replacing
+from nht.writing import replacing
 with replacing(Path(sys.argv[1])) as scratch:
     scratch.write_text("half of")
     os.kill(os.getpid(), signal.SIGKILL)

@@ -47,6 +47,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # starts Ray up to four times
 @pytest.mark.parametrize("number", range(FIRST, FIRST + RUNS))
 def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path, record_property):
     undisturbed, seconds = whole
