@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from nht.envs.arrays import Array, Flags, Rows, Seed
+from nht.envs.free_motion import moved, stage_velocity
 from nht.envs.locomotion import Locomotion, Range, gymnasium_model
 
 # Of a contact sensor: force, torque and position (bits 1, 2 and 4), of all contacts together.
@@ -144,15 +145,18 @@ class Ant(Locomotion):
         a_1 = self._acceleration(q, v_1, control, guess=(v_1 - before) / step)
         v_2 = v_1 + step / 2 * a_1
         a_2 = self._acceleration(moved(q, v_1, step / 2), v_2, control, guess=a_1)
+        w_2 = stage_velocity(v_2, v_1, step / 2)
         v_3 = v_1 + step / 2 * a_2
-        a_3 = self._acceleration(moved(q, v_2, step / 2), v_3, control, guess=a_2)
+        a_3 = self._acceleration(moved(q, w_2, step / 2), v_3, control, guess=a_2)
+        w_3 = stage_velocity(v_3, w_2, step / 2)
         v_4 = v_1 + step * a_3
-        q_4 = moved(q, v_3, step)
+        q_4 = moved(q, w_3, step)
         a_4 = self._acceleration(q_4, v_4, control, guess=a_3)
+        w_4 = stage_velocity(v_4, w_3, step)
         self.torso_x[rows] = q_4[:, 0]
         self.contact_force[rows] = self._external_forces(len(q)).clip(*self.contact_force_range)
 
-        position = moved(q, (v_1 + 2 * v_2 + 2 * v_3 + v_4) / 6, step)
+        position = moved(q, (v_1 + 2 * w_2 + 2 * w_3 + w_4) / 6, step)
         velocity = v_1 + step / 6 * (a_1 + 2 * a_2 + 2 * a_3 + a_4)
         return np.concatenate([time + step, position, velocity], axis=1)
 
@@ -215,21 +219,3 @@ def sensing_model(file: str) -> mujoco.MjModel:
             intprm=[CONTACT_FIELDS, NET_FORCE, 1],
         )
     return spec.compile()
-
-
-def moved(q: Array, v: Array, time: float) -> Array:
-    """Positions ``(N, nq)`` of a free root and hinges after ``time`` [s] at the constant velocity ``v`` ``(N, nv)``."""
-    half_turn = v[:, 3:6] * (time / 2)
-    half_angle = np.linalg.norm(half_turn, axis=1, keepdims=True)
-    turn = np.concatenate([np.cos(half_angle), half_turn * np.sinc(half_angle / np.pi)], axis=1)
-    orientation = quaternion_product(q[:, 3:7], turn)
-    orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
-    return np.concatenate([q[:, :3] + time * v[:, :3], orientation, q[:, 7:] + time * v[:, 6:]], axis=1)
-
-
-def quaternion_product(left: Array, right: Array) -> Array:
-    """Hamilton's product of quaternions ``(N, 4)``, the real part first."""
-    a, u = left[:, :1], left[:, 1:]
-    b, w = right[:, :1], right[:, 1:]
-    real = a * b - (u * w).sum(axis=1, keepdims=True)
-    return np.concatenate([real, a * w + b * u + np.cross(u, w)], axis=1)

@@ -10,6 +10,7 @@ import mujoco
 import pytest
 
 from nht.envs import make_env, make_gymnasium, mujoco_log
+from nht.envs.dm_control import MISSING
 
 LOGGER = "nht.envs.mujoco_log"
 
@@ -64,6 +65,7 @@ def test_a_users_own_handler_stays(fresh, caplog):
 
 def test_making_and_stepping_our_tasks_says_and_writes_nothing(fresh):
     """In a process of its own, as a user's, where no test has taken MuJoCo's words away."""
+    pytest.importorskip("dm_control", reason=MISSING)
     code = """
         import nht.envs
         for name in nht.envs.TASKS:
