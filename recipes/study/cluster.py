@@ -69,8 +69,8 @@ class Cluster:
         Raises:
             RuntimeError: if Ray itself fails, or a run can be neither begun nor recorded: that is no result of a run's.
         """
-        remote = ray.remote(num_cpus=1, max_retries=3)(work)
-        waiting = {remote.options(num_gpus=_gpus(task)).remote(task, folder): task for task in tasks}
+        remote = ray.remote(num_cpus=1, num_gpus=_gpus(tasks), max_retries=3)(work)
+        waiting = {remote.remote(task, folder): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting), num_returns=1)
             task = waiting.pop(ready)
@@ -82,8 +82,8 @@ class Cluster:
                         Ending("failed", _reason(error)).write(folder / job.name)
             except RayError as error:
                 raise RuntimeError(
-                    f"{folder}: {task.name} is not finished: {_reason(error)}. Start the same command again: "
-                    "what was finished is kept."
+                    f"{folder}: the {'run' if len(task.jobs) == 1 else 'pack'} {task.name} is not finished: "
+                    f"{_reason(error)}. Start the same command again: what was finished is kept."
                 ) from error
             yield task
 
@@ -92,8 +92,9 @@ class Cluster:
         ray.shutdown()
 
 
-def _gpus(task: Job | Pack) -> int:
-    return int(any(word.startswith("device=cuda") for word in task.jobs[0].overrides))
+def _gpus(tasks: Sequence[Job] | Sequence[Pack]) -> int:
+    """How many each needs: all tasks of a stage are told the same device."""
+    return int(any(word.startswith("device=cuda") for task in tasks[:1] for word in task.jobs[0].overrides))
 
 
 def _reason(error: RayError) -> str:

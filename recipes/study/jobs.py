@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas
 
-from nht.reading import entry, known_entries, read_json, shortened, shown
+from nht.reading import entry, known_entries, read_json, shortened
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.quiet import quiet_libraries
@@ -108,7 +108,7 @@ class Ending:
         spent = record.get("core_seconds")
         if not (spent is None or (isinstance(spent, int | float) and 0 <= spent < math.inf)):
             raise ValueError(
-                f"{file}: 'core_seconds' must be a finite number, at least 0, got {shown(spent)}."
+                f"{file}: 'core_seconds' must be a finite number, at least 0, got {shortened(spent, 60)!r}."
             )
         return cls(record["status"], entry(record, "reason", str, str(file)), spent)
 
