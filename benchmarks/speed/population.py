@@ -4,15 +4,16 @@ The whole recipes run, physics, replay and evaluations included, in one process 
 of its own. Settings:
 
 - ``search``: DDPG of the search on WAMWipe through NHT: networks of 2 x 128, 40 updates per 400 steps, learning rates,
-  noise, batch sizes and so on drawn from the paper's Table 2; 25 test episodes every 20,000 steps, 100 at the end.
+  noise, batch sizes and so on drawn from the paper's Table 2; 25 test episodes every 20,000 steps. As packs of a
+  search, learners are of nearly one batch size, here around its mean.
 - ``paper``: the paper's own DDPG: 3 x 256, 40 updates of 256 per 200 steps.
-- ``ppo``: OpenAI's ppo2 on HalfCheetah: 2 x 64, 32 x 10 minibatches of 64 per 2,048 steps, one copy a learner.
+- ``ppo``: OpenAI's ppo2 on HalfCheetah: 2 x 64, 32 x 10 minibatches of 64 per 2,048 steps, 16 copies a learner.
 
 Beside them stable-baselines3, one learner with the same networks, batch and ratio on the same task. Every figure is the
 difference of two lengths of the run, so that starting does not count; an evaluation is measured apart. Rounds take
 turns; the median counts, the spread is printed. Writes CSV, table and figure to ``results/population``.
 
-    OMP_NUM_THREADS=1 python benchmarks/speed/population.py [search | paper | ppo | growth ...] [rounds=3]
+    OMP_NUM_THREADS=1 python benchmarks/speed/population.py [search | paper | ppo ...] [rounds=3]
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ SETTINGS: dict[str, list[str]] = {
         "evaluation.episodes=25",
     ],
     "paper": ["env=wam_wipe", "algo=ddpg_paper", "evaluation.episodes=25"],
-    "ppo": ["env=half_cheetah", "map=none", "algo=ppo_paper", "evaluation.episodes=10"],
+    "ppo": ["env=half_cheetah", "map=none", "algo=ppo_paper", "env.num_envs=16", "evaluation.episodes=10"],
 }
 LENGTHS = {"search": (400, 2_000), "paper": (200, 800), "ppo": (2_048, 4_096)}  # steps
 COLUMNS = ("setting", "who", "learners", "bfloat16", "round", "core_seconds", "evaluations", "memory")
@@ -73,15 +74,21 @@ PLAN = {
 }
 
 
-def overrides(setting: str, learner: int, alone: bool, folder: Path) -> list[str]:
+def drawn(learner: int, learners: int) -> dict[str, object]:
+    """What Table 2 gives to one of a pack's learners, whose batch sizes are the nearest to the mean of many."""
+    many = [draw(SPACE, 0, number, "nht") for number in range(8 * learners)]
+    many.sort(key=lambda one: abs(one["algo.batch_size"] - MEAN_BATCH))
+    return {name: value for name, value in many[learner].items() if name.startswith("algo.")}
+
+
+def overrides(setting: str, learner: int, learners: int, folder: Path) -> list[str]:
     """What one learner is told."""
     told = [*SETTINGS[setting], *QUIET, f"seed={learner}", f"run.folder={folder}/{learner}"]
     if setting == "ppo":
         return told
     told.append(f"map.file={folder}/map.safetensors")
     if setting == "search":
-        drawn = draw(SPACE, 0, learner, "nht") | ({"algo.batch_size": MEAN_BATCH} if alone else {})
-        told += [f"{name}={value}" for name, value in drawn.items() if name.startswith("algo.")]
+        told += [f"{name}={value}" for name, value in drawn(learner, learners).items()]
     return told
 
 
@@ -99,7 +106,7 @@ def train(setting: str, learners: int, half: bool, steps: int, every: int) -> fl
             configure(
                 algorithm.schema,
                 "ppo" if setting == "ppo" else "ddpg",
-                [*overrides(setting, learner, learners == 1, folder), *more],
+                [*overrides(setting, learner, learners, folder), *more],
             )
             for learner in range(learners)
         ]
