@@ -28,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -131,7 +131,6 @@ def cost(setting: str, learners: int, half: bool) -> dict[str, float]:
 
 def baseline(setting: str, copies: int) -> dict[str, float]:
     """stable-baselines3's core-seconds per 1,000,000 steps, without evaluations."""
-    make: Callable[[], gymnasium.Env]
     if setting == "ppo":
         env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("HalfCheetah-v5")] * copies), gamma=0.99)
         steps, hidden = 2_048, {"net_arch": [64, 64]}
@@ -145,7 +144,7 @@ def baseline(setting: str, copies: int) -> dict[str, float]:
             seed=0,
         )
     else:
-        make = lambda: gymnasium.make("nht.envs:nht/WAMWipe-v0")  # noqa: E731
+        make = partial(gymnasium.make, "nht.envs:nht/WAMWipe-v0")
         env, motors = DummyVecEnv([make] * copies), 7
         per_update = 10 if setting == "search" else 5
         steps = {"search": 2_000, "paper": 500}[setting]

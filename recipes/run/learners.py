@@ -44,7 +44,7 @@ class Learners(Generic[Config]):
     """
 
     def __init__(self, configs: Sequence[Config], device: torch.device) -> None:
-        self._configs, self._device = configs, device
+        self._configs = configs
         self.count = len(configs) if len(configs) > 1 else None
         self.draws = None if self.count is None else Draws([config.seed for config in configs], device)
         check_alike(configs)
