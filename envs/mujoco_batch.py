@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -86,15 +87,23 @@ class BatchedMujocoEnv(WholeSteps):
             "failure": outcome.failure,
             "diverged": outcome.diverged,
         }
-        entries = {name: self._tensor(values[:, None]) for name, values in flags.items()}
-        reward = self._tensor(outcome.reward[:, None].astype(np.float32))
-        return self._pack(self._observations() | entries | {"reward": reward})
+        columns = {name: values[:, None] for name, values in flags.items()}
+        rewards = {"reward": outcome.reward[:, None]}
+        return self._pack(self._moved(self.task.observe() | rewards, np.float32) | self._moved(columns, bool))
 
     def _observations(self) -> dict[str, torch.Tensor]:
-        return {key: self._tensor(values.astype(np.float32)) for key, values in self.task.observe().items()}
+        return self._moved(self.task.observe(), np.float32)
 
-    def _tensor(self, values: NDArray[Any]) -> torch.Tensor:
-        return torch.from_numpy(values).to(self.device).view(*self.batch_size, -1)
+    def _moved(self, values: Mapping[str, NDArray[Any]], dtype: type) -> dict[str, torch.Tensor]:
+        """Arrays ``(N, size)`` as tensors on the device; to a GPU all of them are one transfer."""
+        device, batch = self.device, self.batch_size
+        if device is None or device.type == "cpu":
+            return {
+                name: torch.from_numpy(each.astype(dtype)).view(*batch, -1) for name, each in values.items()
+            }
+        whole = torch.from_numpy(np.concatenate([*values.values()], axis=1).astype(dtype)).to(device)
+        parts = whole.view(*batch, -1).split([each.shape[1] for each in values.values()], dim=-1)
+        return dict(zip(values, parts, strict=True))
 
     def _pack(self, entries: dict[str, torch.Tensor]) -> TensorDict:
         # Shapes and devices are ours: checking them again would cost more than the packing.

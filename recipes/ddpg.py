@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from nht.recipes.agents.adam import LearnersAdam
@@ -23,6 +24,7 @@ from nht.recipes.agents.off_policy import (
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
+from nht.recipes.run.graphs import graphed
 from nht.recipes.run.learners import Learners
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.population import open_run
@@ -32,7 +34,8 @@ from nht.recipes.run.record import Record
 
 def main(*configs: DDPG, together: str | None = None) -> None:
     """Train one learner, or several of one shape at once; evaluate on the way, and say at the end what happened."""
-    ranks = Ranks(configs[0].device, seed=configs[0].seed, threads=configs[0].torch_threads)
+    first = configs[0]
+    ranks = Ranks(first.device, seed=first.seed, threads=first.torch_threads, tf32=first.tf32)
     folder = open_run(configs, ranks, together)
     if folder.whole:
         return folder.show()
@@ -54,6 +57,13 @@ def main(*configs: DDPG, together: str | None = None) -> None:
         ]
     )
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
+
+    @graphed(ranks)
+    def update(batch: TensorDictBase) -> TensorDictBase:
+        losses = loss(batch)
+        descend([losses["loss_actor"], losses["loss_value"]], optimiser, ranks)
+        return losses.detach()
+
     batch_size = learners.each(ranks.share("algo.batch_size", algo.batch_size))
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     explorer = exploring(policy, envs.train, algo)
@@ -79,9 +89,7 @@ def main(*configs: DDPG, together: str | None = None) -> None:
                 for batch in minibatches(
                     buffer, algo.updates_per_batch, batch_size, features, ranks.device, learners.draws
                 ):
-                    losses = loss(batch)
-                    descend([losses["loss_actor"], losses["loss_value"]], optimiser, ranks)
-                    record.count_update(losses)
+                    record.count_update(update(batch))
                     if record.counters.updates % algo.target_update_every == 0:
                         target.step()
 

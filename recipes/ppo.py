@@ -32,7 +32,8 @@ LEARNED_FROM = ("features", "sample", "sample_log_prob", "state_value", "advanta
 
 def main(*configs: PPO, together: str | None = None) -> None:
     """Train one learner, or several of one shape at once; evaluate on the way, and say at the end what happened."""
-    ranks = Ranks(configs[0].device, seed=configs[0].seed, threads=configs[0].torch_threads)
+    first = configs[0]
+    ranks = Ranks(first.device, seed=first.seed, threads=first.torch_threads, tf32=first.tf32)
     folder = open_run(configs, ranks, together)
     if folder.whole:
         return folder.show()

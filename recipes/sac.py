@@ -22,7 +22,7 @@ from nht.recipes.run.record import Record
 def main(config: SAC) -> None:
     """Train, evaluate on the way, and say at the end what happened."""
     algo = config.algo
-    ranks = Ranks(config.device, seed=config.seed, threads=config.torch_threads)
+    ranks = Ranks(config.device, seed=config.seed, threads=config.torch_threads, tf32=config.tf32)
     folder = RunFolder(config, ranks)
     if folder.whole:
         return folder.show()

@@ -202,7 +202,7 @@ def benchmark(chosen: list[str], rounds: int) -> None:
                 handle.flush()
                 print(setting, who, learners, half, {k: round(v, 1) for k, v in found.items()}, flush=True)
     show(file)
-    (OUT / "provenance.json").write_text(json.dumps(provenance(), indent=1))
+    (OUT / "provenance.json").write_text(json.dumps(provenance(rounds), indent=1))
 
 
 def show(file: Path) -> None:

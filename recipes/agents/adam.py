@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -14,8 +14,9 @@ from nht.recipes.agents.settings import Setting, beside, largest
 class LearnersAdam(torch.optim.Adam):
     """``torch.optim.Adam`` over parameters of one learner, or over ``(L, ...)`` of several.
 
-    Where these have learning rates of their own, the optimiser has a group for each, of their parts of the parameters:
-    it takes the same steps as L optimisers would.
+    Adam moves a parameter by the learning rate times something that does not depend on it. Where learners have rates of
+    their own, Adam with a rate of 1 therefore moves a zero, and each learner's part of that, times its own rate, is
+    added to the parameter: two calls for all learners, and to rounding the steps that L optimisers would take.
 
     Args:
         networks: parameters, and their learning rate or rates ``(L,)``.
@@ -24,39 +25,45 @@ class LearnersAdam(torch.optim.Adam):
 
     def __init__(self, networks: Sequence[tuple[Iterable[nn.Parameter], Setting]], eps: float = 1e-8) -> None:
         groups: list[dict[str, Any]] = []
-        self._parted = any(isinstance(rate, Tensor) for _, rate in networks)
+        self._apart: list[tuple[nn.Parameter, nn.Parameter, Tensor]] = []  # parameter, its move, rates
         for parameters, rate in networks:
             own = list(parameters)
-            if not self._parted:
+            if not isinstance(rate, Tensor):
                 groups.append({"params": own, "lr": rate})
                 continue
-            for parameter in own:
-                parameter.grad = torch.zeros_like(parameter)
-            count = len(own[0])
-            rates = rate.tolist() if isinstance(rate, Tensor) else count * [rate]
-            groups += [
-                {"params": [_part(parameter, learner) for parameter in own], "lr": rates[learner]}
-                for learner in range(count)
-            ]
-        super().__init__(groups, eps=eps, fused=True)
-        self._rates = [group["lr"] for group in self.param_groups]
+            moves = [nn.Parameter(torch.zeros_like(parameter)) for parameter in own]
+            groups.append({"params": moves, "lr": 1.0})
+            rates = rate.clone()
+            self._apart += [(each, move, beside(rates, each)) for each, move in zip(own, moves, strict=True)]
+        graphed = groups[0]["params"][0].is_cuda  # the step must be one that a CUDA graph can repeat
+        if graphed:
+            groups = [{**group, "lr": torch.tensor(group["lr"], device="cuda")} for group in groups]
+        super().__init__(groups, eps=eps, fused=True, capturable=graphed)
+        self._rates = [float(group["lr"]) for group in self.param_groups]
 
     def decay(self, share: float) -> None:
         """Let every learning rate be this share of what it began as."""
         for group, rate in zip(self.param_groups, self._rates, strict=True):
-            group["lr"] = rate * share
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate * share)
+            else:
+                group["lr"] = rate * share
+
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Take a step along the gradients."""
+        for parameter, move, _ in self._apart:
+            move.grad = parameter.grad
+        result = super().step(closure)
+        for parameter, move, rates in self._apart:
+            parameter.data.addcmul_(move.data, rates)
+            move.data.zero_()
+        return result
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Forget the gradients; parts of parameters keep the memory that they share with the whole."""
-        super().zero_grad(set_to_none=set_to_none and not self._parted)
-
-
-def _part(parameter: nn.Parameter, learner: int) -> nn.Parameter:
-    """One learner's part of a stacked parameter, with its part of the gradient: both are views."""
-    assert parameter.grad is not None
-    part = nn.Parameter(parameter.data[learner])
-    part.grad = parameter.grad[learner]
-    return part
+        """Forget the gradients."""
+        super().zero_grad(set_to_none)
+        for parameter, _, _ in self._apart:
+            parameter.grad = None
 
 
 def clip_gradients(parameters: Sequence[nn.Parameter], norm: Setting, learners: int | None) -> None:

@@ -70,7 +70,8 @@ class RunningNorm(nn.Module):
         self.mean += deviation * count / total
         self.count.copy_(total[..., 0])
         self.shift.copy_(self.mean)
-        self.scale.copy_((self.squares / total).sqrt().clamp_min(self.floor))
+        # Of what never changes, rounding can leave a sum of squares below 0.
+        self.scale.copy_((self.squares / total).clamp_min(0.0).sqrt().clamp_min(self.floor))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Normalised observations of the same shape."""

@@ -141,16 +141,18 @@ def _minibatches_of_each(
     rows = buffer.storage[: len(buffer)].reshape(-1)  # of all learners, in turn
     drawn = draws.integers(len(buffer), [updates * size for size in sizes])
     # What fills a minibatch up is a learner's own step: a weight of 0 makes nothing of another's NaN.
-    places = torch.arange(learners, device=device).view(1, -1, 1).repeat(updates, 1, width)
+    places = torch.arange(learners, device=device).view(-1, 1, 1).repeat(1, updates, width)
     for learner, (size, own) in enumerate(zip(sizes, drawn, strict=True)):
-        places[:, learner, :size] = own.view(updates, size) * learners + learner
+        places[learner, :, :size] += own.view(updates, size) * learners
     counts = torch.tensor(sizes, device=device).unsqueeze(-1)
     weight = (torch.arange(width, device=device) < counts) / counts
-    for chosen in places:
-        batch = rows[chosen.flatten()].view(learners, width).to(device)
+    # One at a time stays in a processor's cache; a GPU would rather have few large calls.
+    for chosen in places.split(updates if rows.device.type == "cuda" else 1, dim=1):
+        replay = rows[chosen.flatten()].view(chosen.shape).to(device)
         with torch.no_grad():
-            features(batch), features(batch["next"])
-        yield batch if min(sizes) == width else batch.set("weight", weight)
+            features(replay), features(replay["next"])
+        for batch in replay.unbind(1):
+            yield batch if min(sizes) == width else batch.set("weight", weight)
 
 
 def mean_over(batch: TensorDictBase, values: Tensor) -> Tensor:

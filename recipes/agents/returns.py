@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data.postprocs import MultiStep
 from torchrl.envs import EnvBase, TransformedEnv
 
-from nht.recipes.agents.settings import Setting, beside
+from nht.recipes.agents.settings import Setting, beside, largest
 
 Range = tuple[float, float]
 """Smallest and largest value."""
@@ -59,9 +59,9 @@ def n_step_returns(gamma: Setting, steps: int) -> Callable[[TensorDictBase], Ten
     Left as it is, it moves observations ahead but not the flags of their ends, and a target that meets a failure would
     go on to the critic's value of what it led to.
     """
-    if isinstance(gamma, Tensor):  # each learner has its own
+    if isinstance(gamma, Tensor) and steps > 1:  # each learner has its own
         own = [n_step_returns(each, steps) for each in gamma.tolist()]
         return lambda data: torch.stack([look(part) for look, part in zip(own, data, strict=True)])
-    multi_step = MultiStep(gamma, steps)
+    multi_step = MultiStep(largest(gamma), steps)
     multi_step.done_keys = ()
     return multi_step

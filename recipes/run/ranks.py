@@ -45,6 +45,7 @@ class Ranks:
         device: of the tensors; gloo connects CPUs, nccl GPUs.
         seed: of this process's torch, alike in all: they make the same networks.
         threads: that torch may use in each process.
+        tf32: whether a GPU may multiply float32 matrices in TF32.
 
     Attributes:
         rank: number of this process, 0 to ``size - 1``, on whatever machine it runs.
@@ -53,12 +54,18 @@ class Ranks:
     """
 
     def __init__(
-        self, device: torch.device | str = "cpu", *, seed: int | None = None, threads: int | None = None
+        self,
+        device: torch.device | str = "cpu",
+        *,
+        seed: int | None = None,
+        threads: int | None = None,
+        tf32: bool = False,
     ) -> None:
         if threads is not None:
             torch.set_num_threads(threads)
         if seed is not None:
             torch.manual_seed(seed)
+        torch.backends.cuda.matmul.allow_tf32 = tf32
         self.device = usable_device(device)
         self.size = int(os.environ.get("WORLD_SIZE", "1"))
         self.rank = int(os.environ.get("RANK", "0")) if self.size > 1 else 0

@@ -16,6 +16,7 @@ TAKEN = (
     "env.num_threads",
     "device",
     "torch_threads",
+    "tf32",
     "run",
 )
 """Settings that a run may go on with others of; all else is what its checkpoints were made for."""

@@ -373,8 +373,8 @@ def test_unknown_names(name):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_device(name):
+    check_env_specs(make_env(name, num_envs=2, device="cuda", seed=0))
     on_gpu, on_cpu = make_env(name, num_envs=2, device="cuda", seed=0), make_env(name, num_envs=2, seed=0)
-    check_env_specs(on_gpu)
     actions = random_actions(on_cpu, 5)
     data = play(on_gpu, actions.cuda())
     assert data.device.type == "cuda"

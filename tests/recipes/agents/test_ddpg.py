@@ -5,6 +5,8 @@ from copy import deepcopy
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -178,6 +180,15 @@ def test_running_norm_does_not_divide_by_a_vanishing_deviation():
     norm = RunningNorm(1)
     norm.update(torch.full((10, 1), 2.0))
     torch.testing.assert_close(norm(torch.tensor([[2.005]])), torch.tensor([[0.5]]), atol=1e-4, rtol=0)
+
+
+@given(value=st.floats(-10.0, 10.0, width=32), rows=st.integers(1, 500), batches=st.integers(1, 3))
+def test_running_norm_takes_what_never_changes(value, rows, batches):
+    norm = RunningNorm(1)
+    for _ in range(batches):
+        norm.update(torch.full((rows, 1), value))
+    assert norm.scale == norm.floor
+    assert norm(torch.full((1, 1), value)).abs() < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Generators of several learners: each draws what it would draw alone."""
 
+import copy
 from dataclasses import dataclass
 
 import pytest
@@ -109,6 +110,41 @@ def test_they_go_on_from_their_state():
     later.load_state_dict(state)
     assert torch.equal(later.orders(50), expected)
     assert all(torch.equal(value, kept[name]) for name, value in state.items())
+
+
+def drawn(draws, calls=5):
+    """Normal and uniform tensors of two shapes, in turn."""
+    with draws.for_all():
+        learners = len(draws.generators)
+        return [
+            (torch.randn(learners, 2), torch.rand(learners, 2), torch.zeros(learners, 3).normal_(2.0, 0.1))
+            for _ in range(calls)
+        ]
+
+
+def assert_equal(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        assert all(torch.equal(*pair) for pair in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("ahead", [2, 3, 64])
+def test_draws_ahead_of_time_do_not_depend_on_others(ahead):
+    together = drawn(Draws(SEEDS, CPU, ahead))
+    for learner, seed in enumerate(SEEDS):
+        own = drawn(Draws([seed], CPU, ahead))
+        assert_equal([[values[learner : learner + 1] for values in each] for each in together], own)
+    values = torch.cat([each[2].flatten() for each in drawn(Draws(SEEDS, CPU, ahead), 200)])
+    assert len(values.unique()) > 0.99 * len(values)  # none is given out twice
+    assert abs(float(values.mean()) - 2.0) < 0.02
+    assert abs(float(values.std()) - 0.1) < 0.01
+
+
+@pytest.mark.parametrize("ahead", [2, 3, 64])
+def test_draws_ahead_of_time_go_on_from_their_state(ahead):
+    draws, later = Draws(SEEDS, CPU, ahead), Draws((0, 0, 0), CPU, ahead)
+    drawn(draws)
+    later.load_state_dict(copy.deepcopy(draws.state_dict()))
+    assert_equal(drawn(later, 100), drawn(draws, 100))
 
 
 def test_the_generators_of_another_number_of_learners():
