@@ -10,7 +10,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pandas
@@ -44,13 +44,14 @@ def main() -> None:
     """Run the GPU's tests, then train a little with every algorithm, on the device and on the CPU."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--algorithms", nargs="+", choices=ALGORITHMS, default=ALGORITHMS)
     parser.add_argument("--tests", action=argparse.BooleanOptionalAction, default=True)
     told = parser.parse_args()
     print(f"torch {torch.__version__}, {name_of(told.device)}")
     if told.tests:
         run_tests()
     with tempfile.TemporaryDirectory() as scratch:
-        rows = list(compared(Path(scratch), told.device))
+        rows = list(compared(Path(scratch), told.device, told.algorithms))
     table = pandas.DataFrame(rows)
     print(table.to_string(index=False))
     if wrong := table.loc[~table["agrees"], ["task", "algorithm"]].to_numpy().tolist():
@@ -79,10 +80,10 @@ def run_tests() -> None:
     subprocess.run(command, cwd=ROOT, check=True)
 
 
-def compared(scratch: Path, device: str) -> Iterator[dict[str, object]]:
+def compared(scratch: Path, device: str, algorithms: Sequence[str]) -> Iterator[dict[str, object]]:
     """A row for every task and algorithm: speeds on the device, and whether its first losses are the CPU's."""
     for task, map in TASKS.items():
-        for algorithm in ALGORITHMS:
+        for algorithm in algorithms:
             runs = [
                 trained(scratch / f"{task}-{algorithm}-{place}", task, map, algorithm, where)
                 for place, where in (("cpu", "cpu"), ("device", device))
