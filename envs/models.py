@@ -36,7 +36,7 @@ def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjMo
         with warnings_logged(logging.INFO, others=True):
             return build()
     except ValueError as error:
-        raise ValueError(f"{name} does not compile: {error}") from error
+        raise ValueError(f"{name} does not compile: {str(error).removesuffix('.')}.") from error
 
 
 def check_state(model: mujoco.MjModel, qpos: Array, qvel: Array, copies: int, tolerance: float) -> None:

@@ -156,7 +156,8 @@ def find_task(name: str) -> TaskRecord:
     try:
         return TASKS[name]
     except (ImportError, TypeError) as error:
-        raise ValueError(f"the environment {name!r} cannot be found: {error}") from error
+        reason = str(error).removesuffix(".")
+        raise ValueError(f"the environment {name!r} cannot be found: {reason}.") from error
 
 
 def make_task(name: str, **options: Any) -> BatchedTask:

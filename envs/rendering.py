@@ -187,7 +187,8 @@ class OwnRenderer:
         try:
             picture = self._draw()
         except gymnasium.error.DependencyNotInstalled as error:
-            raise RuntimeError(f"the environment cannot be drawn: {error}") from error
+            reason = str(error).removesuffix(".")
+            raise RuntimeError(f"the environment cannot be drawn: {reason}.") from error
         picture = np.asarray(picture)
         if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
             raise RuntimeError(

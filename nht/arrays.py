@@ -9,6 +9,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from nht.reading import shortened
+
 WIDER: dict[str, type[np.generic]] = {
     "u2": np.int32,
     "u4": np.int64,
@@ -34,7 +36,7 @@ def as_tensor(values: Tensor | ArrayLike, name: str) -> Tensor:
     try:
         array: Any = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise ValueError(f"{name} is no array: {error}.") from None
+        raise ValueError(f"{name} is no array: {shortened(error)}.") from None
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} must hold numbers or truth values, got an array of type {array.dtype}.")
     kind = array.dtype.str[1:]

@@ -78,8 +78,8 @@ class Demos:
         Args:
             data: (T,), or (N, T) with a trajectory in each row; in order of time, outcomes under "next".
             actuation_key: (*batch, n), what the motors got.
-            context: keys that may serve as context, or such keys by the names they get: `{"goal": ("info",
-                "goal")}`; those that also stand under "next" are taken along.
+            context: keys that may serve as context, or such keys by the names they get: ``{"goal": ("info",
+                "goal")}``; those that also stand under "next" are taken along.
             episode_key: integers that differ between episodes, where they are not "episode" or those of a
                 collector.
             done_key: true at an episode's last step, where it is not "done", "terminated" or "truncated".

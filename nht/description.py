@@ -11,6 +11,7 @@ from nht.action_map import ActionMap
 from nht.arguments import plain
 from nht.lipschitz import certificate
 from nht.map_classes import find_by_name, find_class, identity
+from nht.reading import shortened
 
 
 def describe(map: ActionMap) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def twin(description: dict[str, Any], allow: Sequence[str] = ()) -> ActionMap:
     try:
         map = kind(*positional, **named)
     except TypeError as error:
-        raise ValueError(f"holds arguments that {name} does not take: {error}.") from error
+        raise ValueError(f"holds arguments that {name} does not take: {shortened(error)}.") from error
     keys = description["context_keys"]
     if keys is not None:
         map.context_keys = tuple(_key(key) for key in keys)

@@ -12,6 +12,7 @@ from nht.alignment import Aligned
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.maps import NHT, SVD, Identity
+from nht.reading import shortened
 from nht.residual import Residual
 from nht.scl import SCL
 
@@ -50,7 +51,7 @@ def find_class(module: str, name: str, allow: Sequence[str] = ()) -> type[Action
     if not found:
         raise ValueError(f"the module {module!r} is imported, but has no action map {name!r}.")
     if len(found) > 1:
-        raise ValueError(f"the module {module!r} has made {len(found)} classes {name!r}: which is meant?")
+        raise ValueError(f"the module {module!r} has made {len(found)} classes {name!r}; it must have one.")
     return found[0]
 
 
@@ -96,7 +97,7 @@ def _import(module: str, name: str, allow: Sequence[str]) -> None:
     try:
         importlib.import_module(module)
     except Exception as error:  # a module may raise anything
-        reason = f"{type(error).__name__}: {error}"
+        reason = shortened(f"{type(error).__name__}: {error}")
         raise ValueError(f"its class {name!r} needs the module {module!r}: {reason}.") from error
 
 

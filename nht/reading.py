@@ -97,7 +97,7 @@ def naming(file: object) -> Iterator[None]:
         text = str(error.args[0]) if error.args else ""
         if type(error) not in (ValueError, KeyError) or str(file) in text:
             raise
-        raise type(error)(f"{file}: {text}") from error
+        raise type(error)(f"{file}: {text.removesuffix('.')}.") from error
     except (RuntimeError, IndexError, TypeError) as error:
         raise ValueError(f"{file} holds arrays that do not go together: {shortened(error)}.") from error
 

@@ -12,7 +12,6 @@ import math
 import stat
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 import torch
@@ -23,6 +22,7 @@ from torch import Tensor
 from nht.action_map import ActionMap
 from nht.allowance import Allowance
 from nht.description import describe, of_version_1, twin
+from nht.reading import shortened
 from nht.storable import check_storable, state_of
 from nht.writing import replacing
 
@@ -83,7 +83,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
     except Exception as error:  # whatever stands in a file, the answer names the file
         known = isinstance(error, ValueError) and not isinstance(error, UnicodeError | json.JSONDecodeError)
         reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
-        raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}.") from error
+        raise ValueError(f"{path} {shortened(reason, LONGEST_REASON)}.") from error
     return map.to(device).eval().requires_grad_(False)
 
 
@@ -137,7 +137,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise ValueError(f"is no safetensors file, or is cut short: {error}.") from error
+        raise ValueError(f"is no safetensors file, or is cut short: {shortened(error)}.") from error
 
 
 def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
@@ -197,4 +197,4 @@ def format_version(path: str | Path) -> int:
     try:
         return int(_read(Path(path))[0].get("format_version", "0"))
     except ValueError as error:
-        raise ValueError(f"{path} {error}") from error
+        raise ValueError(f"{path} {shortened(error)}.") from error

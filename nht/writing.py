@@ -81,7 +81,7 @@ def check_room(folder: Path, size: float, what: str) -> None:
         folder = folder.parent
     free = shutil.disk_usage(folder).free
     if free < 1.05 * size + 2**20:
-        text = f"{what} takes {size / 1e6:.1f} MB, only {free / 1e6:.1f} MB are left in {folder}"
+        text = f"{what} takes {size / 1e6:.1f} MB, only {free / 1e6:.1f} MB are left in {folder}."
         raise OSError(errno.ENOSPC, text)
 
 

@@ -126,7 +126,8 @@ def _mistake(
     schema: type[Any], error: HydraException | OmegaConfBaseException, words: Sequence[str]
 ) -> ValueError:
     rule = rule_for(error, words)
-    return ValueError(f"{reason(error)}. {rule}" if rule else f"{reason(error)}{_existing(schema, error)}")
+    text = f"{reason(error)}. {rule}" if rule else f"{reason(error)}{_existing(schema, error)}"
+    return ValueError(f"{text.removesuffix('.')}.")
 
 
 def _help(main: Callable[..., object], schema: type[Any], name: str, overrides: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase
 
 from nht.envs.table import Table, imported
+from nht.reading import shortened
 from nht.recipes.sections import Training
 
 
@@ -71,7 +72,7 @@ def find_algorithm(name: str) -> Algorithm:
     try:
         return ALGORITHMS[known]
     except (ImportError, TypeError) as error:
-        raise ValueError(f"the algorithm {name!r} cannot be found: {error}") from error
+        raise ValueError(f"the algorithm {name!r} cannot be found: {shortened(error)}.") from error
 
 
 def name_of(schema: type[Training]) -> str:

@@ -11,6 +11,7 @@ import nht
 from nht.envs import TASKS, Arm
 from nht.envs.registry import TaskRecord, find_task
 from nht.envs.table import Table
+from nht.reading import shortened
 from nht.recipes.sections import DEFAULT_SCALE, EnvConfig, MapConfig
 
 NETWORK_SETTINGS = ("hidden", "activation", "multi_head", "start", "lipschitz", "beta_kl", "beta_dynamics")
@@ -105,7 +106,7 @@ def find_kind(name: str) -> MapKind:
     try:
         return KINDS[name]
     except (ImportError, TypeError) as error:
-        raise ValueError(f"the map kind {name!r} cannot be found: {error}") from error
+        raise ValueError(f"the map kind {name!r} cannot be found: {shortened(error)}.") from error
 
 
 def file_name(kind: str) -> str:
@@ -191,7 +192,7 @@ def make_map(
         return build(**arguments)
     except TypeError as error:
         raise ValueError(
-            f"map.kind {map.kind!r} cannot be built from {sorted(arguments)}: {error}."
+            f"map.kind {map.kind!r} cannot be built from {sorted(arguments)}: {shortened(error)}."
         ) from error
 
 

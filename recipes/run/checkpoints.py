@@ -55,9 +55,9 @@ class Checkpoints:
                 write_checkpoint(place, states)
                 publish(place, path)
         except OSError as error:
-            reason = f"no checkpoint after {frames} steps: {error.strerror or error}"
+            reason = f"no checkpoint after {frames} steps: {shortened(error.strerror or error)}"
             latest = max(self._found().items(), default=(0, None))[1]
-            raise OSError(error.errno, f"{reason}. The last one is {latest}") from error
+            raise OSError(error.errno, f"{reason}. The last one is {latest}.") from error
         self._prune(frames)
 
     def _prune(self, frames: int) -> None:
@@ -149,7 +149,7 @@ def _is_whole(path: Path) -> bool:
         with CheckpointFile(path) as file:
             file.check()
     except (ValueError, OSError) as error:
-        warnings.warn(f"{path} cannot be read and is passed over: {error}", stacklevel=3)
+        warnings.warn(f"{path} cannot be read and is passed over: {shortened(error)}.", stacklevel=3)
         return False
     return True
 
