@@ -21,8 +21,8 @@ from torchrl.envs.transforms import (
 
 from nht.envs.foreign_copies import ForeignCopy, longest
 from nht.envs.foreign_specs import check_specs
+from nht.envs.outcome import INFO_FLAGS
 
-FLAGS = ("success", "failure", "diverged")
 UNSEEN = ("step_count",)
 """What is no observation: TorchRL's own clock."""
 
@@ -41,7 +41,7 @@ def flattened(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], Foreig
     env = make()
     check_specs(env, name)
     copy = simulator(env)
-    aside = {*FLAGS, *UNSEEN, *copy.aside}
+    aside = {*INFO_FLAGS, *UNSEEN, *copy.aside}
     keys = [key for key in env.observation_spec if key not in aside]
     shapes = {key: env.observation_spec[key].shape for key in (*keys, *copy.aside)}
     transforms: list[Transform] = [
@@ -79,7 +79,7 @@ class OutcomeFlags(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         unset = torch.zeros(*next_tensordict.batch_size, 1, dtype=torch.bool, device=next_tensordict.device)
-        for name in FLAGS:
+        for name in INFO_FLAGS:
             if name not in next_tensordict:
                 next_tensordict[name] = unset.clone()
         return next_tensordict
@@ -90,7 +90,7 @@ class OutcomeFlags(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Register the flags: collectors drop what is not in the specs."""
         shape = (*observation_spec.shape, 1)
-        for name in FLAGS:
+        for name in INFO_FLAGS:
             if name not in list(observation_spec.keys()):
                 observation_spec[name] = Binary(
                     n=1, shape=shape, dtype=torch.bool, device=observation_spec.device

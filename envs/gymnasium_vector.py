@@ -12,7 +12,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from nht.envs.arrays import Array, Flags
-from nht.envs.gymnasium_env import FLAGS, check_render_mode, metadata_of, spaces_of
+from nht.envs.gymnasium_env import check_render_mode, metadata_of, spaces_of
+from nht.envs.outcome import INFO_FLAGS
 from nht.envs.pictures import Pictures
 from nht.envs.registry import make_task
 from nht.envs.simulation import DEFAULT_SIZE
@@ -105,7 +106,7 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
             self.task.reset(np.flatnonzero(mask))
         self._ended = ~mask & (everyone if self._ended is None else self._ended)
         observations, raw = self._observe()
-        off = {name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS}
+        off = {name: np.zeros(self.num_envs, dtype=bool) for name in INFO_FLAGS}
         return observations, _with_masks(raw | off, mask)
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
@@ -127,7 +128,7 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
             self.task.reset(np.flatnonzero(resetting))
         rewards = np.where(resetting, 0.0, outcome.reward)
         terminations, truncations = outcome.terminated & ~resetting, outcome.truncated & ~resetting
-        flags = {name: getattr(outcome, name) & ~resetting for name in FLAGS}
+        flags = {name: getattr(outcome, name) & ~resetting for name in INFO_FLAGS}
         self._ended = terminations | truncations
         final = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():

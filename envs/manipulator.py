@@ -12,7 +12,7 @@ from nht.envs.arrays import Array, Flags, Seed
 from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
 
-ARM = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist")
+ARM_JOINTS = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist")
 FINGERS = ("finger", "fingertip", "thumb", "thumbtip")
 BALL = ("ball_x", "ball_z", "ball_y")
 LINKS = ("upper_arm", "middle_arm", "lower_arm", "hand")
@@ -65,7 +65,8 @@ class BringBall(SuiteTask):
         )
         model = self.model
         self._arm, self._fingers, self._ball = (
-            np.array([model.joint(name).qposadr[0] for name in names]) for names in (ARM, FINGERS, BALL)
+            np.array([model.joint(name).qposadr[0] for name in names])
+            for names in (ARM_JOINTS, FINGERS, BALL)
         )
         self._touch = np.array([model.sensor(name).adr[0] for name in TOUCH])
         self._lengths = np.array([model.body(name).pos[2] for name in LINKS])

@@ -24,3 +24,6 @@ class Outcome:
 
 
 OUTCOME_FLAGS = ("terminated", "truncated", "success", "failure", "diverged")
+
+INFO_FLAGS = ("success", "failure", "diverged")
+"""Those that Gymnasium's ``info`` and TorchRL's TensorDict have beside ``terminated`` and ``truncated``."""

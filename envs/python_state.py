@@ -11,7 +11,7 @@ import numpy as np
 
 from nht.envs.gymnasium_internals import GENERATOR
 
-PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating, types.NoneType)
+PLAIN_TYPES = (bool, int, float, str, np.bool_, np.integer, np.floating, types.NoneType)
 CONSTANT = (
     *(types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type),
     *(gymnasium.Space, gymnasium.envs.registration.EnvSpec, np.dtype),
@@ -121,7 +121,7 @@ def _is_plain(value: Any) -> bool:
         return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
     if isinstance(value, list | tuple | set | frozenset):
         return all(_is_plain(each) for each in value)
-    return isinstance(value, PLAIN)
+    return isinstance(value, PLAIN_TYPES)
 
 
 def _copied(value: Any) -> Any:
@@ -150,7 +150,7 @@ def encoded(value: Any) -> Any:
         return {"dict": {key: encoded(each) for key, each in value.items()}}
     if isinstance(value, list | tuple | set | frozenset):
         items = sorted(value, key=repr) if isinstance(value, set | frozenset) else value
-        kind = type(value).__name__ if type(value) in KINDS.values() else "tuple"
+        kind = type(value).__name__ if type(value) in SEQUENCES.values() else "tuple"
         return {kind: {str(i): encoded(each) for i, each in enumerate(items)}}
     return value
 
@@ -164,7 +164,7 @@ def decoded(saved: Any) -> Any:
         return np.asarray(items)[()]
     if kind == "dict":
         return {key: decoded(each) for key, each in items.items()}
-    return KINDS[kind](decoded(items[str(i)]) for i in range(len(items)))
+    return SEQUENCES[kind](decoded(items[str(i)]) for i in range(len(items)))
 
 
-KINDS: dict[str, type] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
+SEQUENCES: dict[str, type] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}

@@ -20,9 +20,8 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
+from nht.envs.arrays import Array
 from nht.envs.simulation import DEFAULT_SIZE
-
-Array = NDArray[np.float64]
 
 LINE = np.array([0.15, 0.35, 0.85, 0.9], dtype=np.float32)  # red, green, blue, opacity
 

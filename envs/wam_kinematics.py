@@ -10,11 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nht.envs.arm import Arm
-
-Array = NDArray[np.float64]
+from nht.envs.arrays import Array
 
 A = np.array([0.0, 0.0, 0.045, -0.045, 0.0, 0.0, 0.0])
 """DH link lengths [m]."""

@@ -13,7 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from nht.arguments import named_arguments, positional_arguments, recording
+from nht.arguments import named_arguments, positional_arguments, remembering_arguments
 from nht.networks import check_choice
 from nht.saturation import DEFAULT_SATURATION, Saturation, saturate
 from nht.widths import checked_forward, checked_project
@@ -61,7 +61,7 @@ class ActionMap(nn.Module, ABC):
         """Let every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
         super().__init_subclass__(**kwargs)
         for name, wrap in (
-            ("__init__", recording),
+            ("__init__", remembering_arguments),
             ("forward", checked_forward),
             ("project", checked_project),
         ):

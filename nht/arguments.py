@@ -13,7 +13,7 @@ from torch import nn
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.VAR_POSITIONAL)
 
 
-def recording(constructor: Callable[..., None]) -> Callable[..., None]:
+def remembering_arguments(constructor: Callable[..., None]) -> Callable[..., None]:
     """A constructor that remembers what the outermost one was given, in the attribute ``_recorded_arguments``."""
 
     @functools.wraps(constructor)

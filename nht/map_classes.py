@@ -16,7 +16,7 @@ from nht.reading import shortened
 from nht.residual import Residual
 from nht.scl import SCL
 
-OURS: dict[str, type[ActionMap]] = {
+OUR_CLASSES: dict[str, type[ActionMap]] = {
     kind.__name__: kind for kind in (NHT, SVD, Identity, SCL, CAE, LASER, JacobianPinv, Aligned, Residual)
 }
 PACKAGE = "nht"  # the module that files name for all of ours, wherever in the package they are defined
@@ -24,7 +24,7 @@ PACKAGE = "nht"  # the module that files name for all of ours, wherever in the p
 
 def identity(kind: type[ActionMap]) -> tuple[str, str]:
     """Module and qualified name, as they stand in a file."""
-    if OURS.get(kind.__name__) is kind:
+    if OUR_CLASSES.get(kind.__name__) is kind:
         return PACKAGE, kind.__name__
     return kind.__module__, kind.__qualname__
 
@@ -41,9 +41,9 @@ def find_class(module: str, name: str, allow: Sequence[str] = ()) -> type[Action
         ValueError: if its module is neither imported nor allowed, has no such action map, or has two.
     """
     if module == PACKAGE:
-        if name not in OURS:
-            raise ValueError(f"unknown class {name!r}; those of nht are {', '.join(sorted(OURS))}.")
-        return OURS[name]
+        if name not in OUR_CLASSES:
+            raise ValueError(f"unknown class {name!r}; those of nht are {', '.join(sorted(OUR_CLASSES))}.")
+        return OUR_CLASSES[name]
     found = _imported(module, name)
     if not found and module not in sys.modules:
         _import(module, name, allow)
@@ -61,11 +61,11 @@ def find_by_name(name: str) -> type[ActionMap]:
     Raises:
         ValueError: if there is none, or more than one.
     """
-    if name in OURS:
-        return OURS[name]
+    if name in OUR_CLASSES:
+        return OUR_CLASSES[name]
     found = [kind for kind in _concrete() if kind.__name__ == name]
     if not found:
-        known = ", ".join(sorted({*OURS, *(kind.__name__ for kind in _concrete())}))
+        known = ", ".join(sorted({*OUR_CLASSES, *(kind.__name__ for kind in _concrete())}))
         raise ValueError(
             f"unknown class {name!r}; known are {known}. Import a class of your own before loading its map."
         )

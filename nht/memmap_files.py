@@ -34,7 +34,7 @@ DTYPES = {
         torch.complex128,
     )
 }
-PLAIN = "<class 'tensordict._td.TensorDict'>"
+TENSORDICT_TYPE = "<class 'tensordict._td.TensorDict'>"
 """The type of a TensorDict in its ``meta.json``."""
 
 
@@ -72,7 +72,7 @@ def write_tensordict(data: TensorDictBase, folder: Path) -> None:
         }
         if value.numel():
             (folder / f"{file_name(key)}.memmap").write_bytes(raw(value))
-    record |= {"shape": list(data.batch_size), "device": "cpu", "_type": PLAIN}
+    record |= {"shape": list(data.batch_size), "device": "cpu", "_type": TENSORDICT_TYPE}
     (folder / META).write_text(json.dumps(record, separators=(",", ":")))
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from nht.demos import Demos
 from nht.minari_episodes import minari_episodes
-from nht.minari_file import check_dataset, leaves_that_are_no_arrays, local_datasets
-from nht.minari_internals import FOLDER, METADATA, UNREADABLE, datasets_root, import_minari
+from nht.minari_file import check_minari_dataset, leaves_that_are_no_arrays, local_datasets
+from nht.minari_internals import FOLDER, METADATA, MINARI_ERRORS, datasets_root, import_minari
 from nht.reading import naming, shortened, shown
 
 if TYPE_CHECKING:
@@ -69,9 +69,9 @@ def open_minari(dataset: MinariDataset | str | Path) -> MinariDataset:
         return dataset
     folder = _data_folder(dataset)
     try:
-        check_dataset(folder)
+        check_minari_dataset(folder)
         return minari.MinariDataset(folder)
-    except UNREADABLE as error:
+    except MINARI_ERRORS as error:
         raise ValueError(f"the Minari dataset {dataset} cannot be read: {shortened(error, 600)}.") from error
 
 

@@ -25,7 +25,7 @@ NAMESPACE = "namespace_metadata.json"
 JPEG = b"\xff\xd8\xff"
 """What every JPEG file begins with; Minari stores frames so, unless the metadata's ``jpeg_encoding`` is false."""
 
-UNREADABLE = (
+MINARI_ERRORS = (
     OSError,
     ValueError,
     LookupError,

@@ -28,8 +28,8 @@ from nht.writing import replacing
 
 __all__ = ["format_version", "load_map", "save_map"]
 
-FORMAT = "nht.action_map"
-FORMAT_VERSION = 2
+MAP_FORMAT = "nht.action_map"
+MAP_FORMAT_VERSION = 2
 LONGEST_REASON = 600  # characters of what an error says about a file
 
 
@@ -51,7 +51,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
     tensors = state_of(map)
     _check_finite(tensors, check_storable(map).state_dict())
     text = json.dumps(describe(map))
-    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": text}
+    header = {"format": MAP_FORMAT, "format_version": str(MAP_FORMAT_VERSION), "map": text}
     header["checksum"] = _checksum(text, tensors)
     content = save(tensors, header)
     with replacing(path) as scratch:
@@ -111,11 +111,11 @@ def _check_readable(path: Path) -> None:
 
 def _loaded(path: Path, allow: Sequence[str]) -> ActionMap:
     header, tensors = _read(path)
-    if header.get("format") != FORMAT:
-        raise ValueError(f"holds no action map: its header is not marked {FORMAT!r}.")
+    if header.get("format") != MAP_FORMAT:
+        raise ValueError(f"holds no action map: its header is not marked {MAP_FORMAT!r}.")
     found = header.get("format_version")
-    if found not in ("1", str(FORMAT_VERSION)):
-        raise ValueError(f"has format version {found}, this version of nht reads 1 and {FORMAT_VERSION}.")
+    if found not in ("1", str(MAP_FORMAT_VERSION)):
+        raise ValueError(f"has format version {found}, this version of nht reads 1 and {MAP_FORMAT_VERSION}.")
     if found == "1" and "checksum" in header:
         raise ValueError("was changed: it says format version 1, which has no checksum, and has one.")
     text = header["map"]

@@ -22,7 +22,7 @@ from nht.reading import naming
 from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import CollectDemos
 from nht.recipes.data.files import FILES, best_episodes, read_episodes
-from nht.recipes.data.recording import COPIES, endings, has_success, record, record_expert
+from nht.recipes.data.recording import COPIES, endings, has_success, record_episodes, record_expert
 from nht.recipes.launch import launch
 from nht.recipes.maps.kinds import known_task, task_context_keys
 from nht.recipes.run.environments import mapped_env
@@ -83,7 +83,7 @@ def record_policy(
     simulation = mapped_env(task_config, kept_map(folder, trained, allow=allow), seed=seed, num_envs=COPIES)
     policy = load_policy(folder, simulation, trained)
     with closing(simulation), set_exploration_type(ExplorationType.DETERMINISTIC):
-        data, left_out = record(
+        data, left_out = record_episodes(
             simulation,
             simulation.base_env.task,
             policy,

@@ -21,8 +21,15 @@ import nht
 from nht.recipes.config import CompareMaps
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
-from nht.recipes.maps.interface import train_map
-from nht.recipes.maps.kinds import arm_of, file_name, find_kind, make_map, map_context_keys, tasks_with_arm
+from nht.recipes.maps.interface import trained_map
+from nht.recipes.maps.kinds import (
+    arm_of,
+    find_kind,
+    kind_in_file_name,
+    make_map,
+    map_context_keys,
+    tasks_with_arm,
+)
 
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
@@ -63,10 +70,10 @@ def main(config: CompareMaps) -> None:
     rows, maps, table = [], {}, pandas.DataFrame()
     out.mkdir(parents=True)
     for settings in chosen:
-        trained = train_map(settings, config.env, config.demos, config.seed)
+        trained = trained_map(settings, config.env, config.demos, config.seed)
         kind, k = settings.kind, trained.map.action_dim
         maps[kind, k] = trained.map
-        nht.save_map(trained.map, out / "maps" / f"{file_name(kind)}-k{k}.safetensors")
+        nht.save_map(trained.map, out / "maps" / f"{kind_in_file_name(kind)}-k{k}.safetensors")
         rows.append({"map": kind, "k": k, **_measured(trained, demos)})
         table = pandas.DataFrame(rows)
         table.to_csv(out / "table.csv", index=False)

@@ -64,7 +64,7 @@ def _settings(prefix: str, schema: type[Any], values: Mapping[str, Any]) -> Iter
     """A line per setting: name, value, meaning."""
     found = meanings(schema)
     for name, value in values.items():
-        setting = f"  {prefix}{name}={shown(value)}"
+        setting = f"  {prefix}{name}={as_typed(value)}"
         meaning = found.get(name, "")
         if len(setting) > 44 and meaning:
             yield setting
@@ -72,7 +72,7 @@ def _settings(prefix: str, schema: type[Any], values: Mapping[str, Any]) -> Iter
         yield f"{setting:<44}  # {meaning}" if meaning else setting
 
 
-def shown(value: Any) -> str:
+def as_typed(value: Any) -> str:
     """A value as the command line takes it, on one line."""
     if isinstance(value, str):
         return value

@@ -24,17 +24,17 @@ from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.metrics import FRAMES
 from nht.recipes.run.ownership import claimed
 from nht.recipes.study.jobs import Ending, Job, job_name, rows_of, run_job
-from nht.recipes.study.packs import Pack, packed, run_pack
-from nht.recipes.study.report import summary
+from nht.recipes.study.packs import Pack, in_packs, run_pack
+from nht.recipes.study.report import search_summary
 from nht.recipes.study.results import SearchResults, read_results
 from nht.recipes.study.rows_file import COLUMNS
-from nht.recipes.study.space import draw, write_manifest
+from nht.recipes.study.space import draw_settings, write_search_manifest
 from nht.writing import replacing
 
 if TYPE_CHECKING:
     from nht.recipes.study.cluster import Cluster
 
-FRESH = 100
+FIRST_FRESH_SEED = 100
 """First seed of the runs of best configurations: the search's own count from 0."""
 
 POLL = 5.0
@@ -48,12 +48,12 @@ def main(config: Search) -> None:
     demos = Path(config.demos.path or folder / "demos").resolve()
     jobs = search_jobs(search, demos)
     check_settings(jobs, folder)
-    packed(jobs, search.learners)  # whether the algorithm trains several
+    in_packs(jobs, search.learners)  # whether the algorithm trains several
     from nht.recipes.study.cluster import Cluster  # Ray is an extra of its own
 
     settings = asdict(search) | {"demos": asdict(config.demos)}
     del settings["learners"]  # decides nothing but the cost
-    write_manifest(folder / "manifest.json", settings)
+    write_search_manifest(folder / "manifest.json", settings)
     with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
         if config.demos.path is None:
             record_demos(config, folder, demos)
@@ -61,7 +61,7 @@ def main(config: Search) -> None:
         run_all(jobs, folder, cluster, ended, search.learners)
         if search.best_seeds:
             run_all(best_jobs(search, demos, ended), folder, cluster, ended, search.learners)
-    print(summary(SearchResults.of(together(ended))).to_string(index=False))
+    print(search_summary(SearchResults.of(together(ended))).to_string(index=False))
     print(f"\n{folder}: manifest.json, rows.csv; figures: python -m nht.recipes.report {config.folder}")
 
 
@@ -103,7 +103,7 @@ def best_jobs(search: SearchConfig, demos: Path, ended: Rows) -> list[Job]:
     results = SearchResults.of(together(ended))
     best = {interface: results.best(interface)[0] for interface in search.interfaces}
     return [
-        make_job(search, demos, "best", interface, configuration, FRESH + seed, search.best_frames)
+        make_job(search, demos, "best", interface, configuration, FIRST_FRESH_SEED + seed, search.best_frames)
         for seed in range(search.best_seeds)
         for interface, configuration in best.items()
     ]
@@ -119,7 +119,7 @@ def make_job(
     frames: int,
 ) -> Job:
     """One run: what a person would type."""
-    parameters = draw(search.space, search.seed, configuration, interface)
+    parameters = draw_settings(search.space, search.seed, configuration, interface)
     told = dict(parameters)
     if "map.hidden_layers" in told:
         told["map.hidden"] = str(int(told.pop("map.hidden_layers")) * [told.pop("map.hidden_units")])
@@ -171,7 +171,7 @@ def tasks_of(
         yield from cluster.run(run_job, missing, folder)
         return
     names = {job.name for job in missing}
-    packs = [pack for pack in packed(jobs, learners) if any(job.name in names for job in pack.jobs)]
+    packs = [pack for pack in in_packs(jobs, learners) if any(job.name in names for job in pack.jobs)]
     yield from cluster.run(run_pack, packs, folder)
 
 

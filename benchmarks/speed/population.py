@@ -43,7 +43,7 @@ from taking_turns import provenance
 import nht
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
-from nht.recipes.study.space import draw
+from nht.recipes.study.space import draw_settings
 
 HERE = Path(__file__).parents[1]
 OUT = HERE / "results" / "population"
@@ -76,7 +76,7 @@ PLAN = {
 
 def drawn(learner: int, learners: int) -> dict[str, object]:
     """What Table 2 gives to one of a pack's learners, whose batch sizes are the nearest to the mean of many."""
-    many = [draw(SPACE, 0, number, "nht") for number in range(8 * learners)]
+    many = [draw_settings(SPACE, 0, number, "nht") for number in range(8 * learners)]
     many.sort(key=lambda one: abs(one["algo.batch_size"] - MEAN_BATCH))
     return {name: value for name, value in many[learner].items() if name.startswith("algo.")}
 

@@ -27,7 +27,7 @@ VIOLIN_ROWS = 5_000  # about as many transitions make the outlines
 GREY = "0.55"
 
 
-def draw(episodes: Episodes, directions: int) -> Figure:
+def draw_figure(episodes: Episodes, directions: int) -> Figure:
     """Lengths, returns, energy of the global directions, actuation per motor, and the actuation of some episodes."""
     data, lengths = episodes.data, lengths_of(episodes.data)
     actuation = data["actuation"]

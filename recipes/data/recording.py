@@ -19,7 +19,7 @@ from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig
 
 COPIES = 100
-FLAGS = ("reward", "success", "terminated", "truncated", "done")
+RECORDED = ("reward", "success", "terminated", "truncated", "done")
 
 Controller = Callable[[TensorDictBase], TensorDictBase]
 """Writes ``"action"`` into what the environment shows."""
@@ -46,7 +46,9 @@ def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Pat
         return current.set("action", torch.from_numpy(expert(observation)).float())
 
     with closing(simulation):
-        data, left_out = record(simulation, simulation.task, act, demos, judged=has_success(env.name))
+        data, left_out = record_episodes(
+            simulation, simulation.task, act, demos, judged=has_success(env.name)
+        )
     manifest = {"options": options, "expert": settings, "left_out_episodes": left_out}
     name = type(expert).__name__
     return nht.save_demos(data, path, env=env.name, seed=seed, expert=name, settings=manifest)
@@ -63,7 +65,7 @@ def has_success(task: str) -> bool:
 
 
 @torch.no_grad()
-def record(
+def record_episodes(
     simulation: EnvBase,
     task: BatchedTask,
     act: Controller,
@@ -120,7 +122,7 @@ def _transition(
     entries = {
         **{key: stepped[key] for key in keys},
         "actuation": stepped[actuation_key],
-        **{flag: outcome[flag] for flag in FLAGS},
+        **{flag: outcome[flag] for flag in RECORDED},
         "next": {key: outcome[key] for key in keys},
         "good": good,
     }

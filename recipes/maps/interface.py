@@ -22,7 +22,7 @@ from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig, Training
 from nht.storage import format_version
 
 
-def train_map(
+def trained_map(
     map: MapConfig,
     env: EnvConfig,
     demos: DemosConfig,
@@ -160,7 +160,7 @@ def run_map(settings: Training, motors: int) -> nht.MapTraining:
         return nht.MapTraining(loaded, {})
     if map.kind == "none" and map.residual is None and default_scale(map) is not None:
         return nht.MapTraining(_configured(nht.Identity(motors), map), {})
-    return train_map(map, env, settings.demos, settings.seed)
+    return trained_map(map, env, settings.demos, settings.seed)
 
 
 def number_of_actions(settings: Training, motors: int, context_dim: int) -> int:

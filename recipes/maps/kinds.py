@@ -109,7 +109,7 @@ def find_kind(name: str) -> MapKind:
         raise ValueError(f"the map kind {name!r} cannot be found: {shortened(error)}.") from error
 
 
-def file_name(kind: str) -> str:
+def kind_in_file_name(kind: str) -> str:
     """A kind's name as part of a file's."""
     return kind.replace(":", ".")
 

@@ -17,13 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nht.memmap_files import DTYPES, META, PLAIN, STORAGE, file_name, raw
+from nht.memmap_files import DTYPES, META, STORAGE, TENSORDICT_TYPE, file_name, raw
 from nht.reading import MAX_TEXT, checksum, entry, parse_json, plain_file, shortened
 from nht.recipes.run.state_json import decoded
 
 FORMAT, FORMAT_VERSION = "torchrl.checkpoint", 1
-MANIFEST = "manifest.json"
-CHUNK = 2**24
+CHECKPOINT_MANIFEST = "manifest.json"
+CHUNK_BYTES = 2**24
 DAMAGED = (
     zipfile.BadZipFile,
     OSError,
@@ -80,8 +80,8 @@ class CheckpointFile:
         return members
 
     def _read_manifest(self) -> dict[str, Any]:
-        where = f"{self.file}, {MANIFEST}"
-        manifest = self._json(MANIFEST)
+        where = f"{self.file}, {CHECKPOINT_MANIFEST}"
+        manifest = self._json(CHECKPOINT_MANIFEST)
         if manifest.get("format") != FORMAT:
             raise ValueError(f"{where} is not marked {FORMAT!r}.")
         if entry(manifest, "format_version", int, where) != FORMAT_VERSION:
@@ -102,8 +102,8 @@ class CheckpointFile:
 
     def check(self) -> None:
         """Raise ValueError unless every byte is what was written."""
-        if self._sums and self._sums.keys() != self._members.keys() - {MANIFEST}:
-            raise ValueError(f"{self.file} has other members than its {MANIFEST} says.")
+        if self._sums and self._sums.keys() != self._members.keys() - {CHECKPOINT_MANIFEST}:
+            raise ValueError(f"{self.file} has other members than its {CHECKPOINT_MANIFEST} says.")
         for name in self._members:
             self._read(name)
 
@@ -160,7 +160,7 @@ class CheckpointFile:
     def _rows(self, folder: str, length: int) -> dict[str, Any]:
         """The first rows of a TensorDict as it lays itself out in raw files."""
         about = self._json(f"{folder}/{META}")
-        if about.get("_type") != PLAIN:
+        if about.get("_type") != TENSORDICT_TYPE:
             raise ValueError(f"{self.file}, {folder}/{META} is of another type than TensorDict.")
         rows: dict[str, Any] = {}
         for key, record in about.items():
@@ -198,7 +198,7 @@ class CheckpointFile:
         digest, done = hashlib.sha256(), 0
         try:
             with self._archive.open(self._member(name)) as member:
-                while chunk := member.read(CHUNK):
+                while chunk := member.read(CHUNK_BYTES):
                     digest.update(chunk)
                     if into is not None:
                         into[done : done + len(chunk)] = chunk
@@ -207,7 +207,7 @@ class CheckpointFile:
             raise ValueError(
                 f"{self.file}, {shortened(name, 120)} is damaged: {shortened(error)}."
             ) from error
-        if self._sums and name != MANIFEST and self._sums.get(name) != digest.hexdigest():
+        if self._sums and name != CHECKPOINT_MANIFEST and self._sums.get(name) != digest.hexdigest():
             raise ValueError(
                 f"{self.file}, {name} was changed since it was written: its checksum is another."
             )

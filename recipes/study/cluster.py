@@ -109,7 +109,9 @@ def _check_answer(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=ANSWER).close()
     except (OSError, ValueError) as error:
-        raise ConnectionError(f"no Ray cluster answers at ray_address={address}: {shortened(error)}.") from error
+        raise ConnectionError(
+            f"no Ray cluster answers at ray_address={address}: {shortened(error)}."
+        ) from error
 
 
 def _check_machines() -> None:

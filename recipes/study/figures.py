@@ -21,7 +21,7 @@ from nht.recipes.run.metrics import FRAMES, SUCCESS, tested
 from nht.recipes.study.results import SearchResults
 from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
-OTHERS = ("#A6761D", "#7570B3", "#E7298A")
+OTHER_COLOURS = ("#A6761D", "#7570B3", "#E7298A")
 """Colours of interfaces whose kind of map has none of its own."""
 REPEATABLE: Any = {"svg.hashsalt": "nht", "savefig.dpi": 150, "font.size": 10}
 BAND_RESAMPLES = 500
@@ -55,7 +55,7 @@ def colour(interface: str) -> str:
     """The colour of an interface, the same in every figure: that of its kind of map, or one that its name decides."""
     kind = "none" if interface == "raw" else interface
     known = KINDS[kind].colour if kind in list(KINDS) else None
-    return known or OTHERS[sum(interface.encode()) % len(OTHERS)]
+    return known or OTHER_COLOURS[sum(interface.encode()) % len(OTHER_COLOURS)]
 
 
 def _line(interface: str) -> dict[str, Any]:

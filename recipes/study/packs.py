@@ -44,7 +44,7 @@ class Pack:
         return Pack(self.jobs[:middle]), Pack(self.jobs[middle:])
 
 
-def packed(jobs: Sequence[Job], learners: int) -> list[Pack]:
+def in_packs(jobs: Sequence[Job], learners: int) -> list[Pack]:
     """All runs of a stage in packs of at most ``learners``; those of nearly the same batch size together.
 
     Raises:

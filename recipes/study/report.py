@@ -11,7 +11,7 @@ import pandas
 
 from nht.recipes.run.metrics import FRAMES, SUCCESS
 from nht.recipes.study import figures as search_figures
-from nht.recipes.study.results import OURS, SearchResults, read_results
+from nht.recipes.study.results import OUR_INTERFACE, SearchResults, read_results
 from nht.recipes.study.scores import (
     Scores,
     interquartile_mean,
@@ -34,7 +34,7 @@ def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
     out.mkdir(parents=True, exist_ok=True)
     title = title or f"Search on {', '.join(results.rows['env'].unique())}"
     figures = search_figures.draw_all(results, out)
-    table = summary(results)
+    table = search_summary(results)
     sections: Sections = [
         (None, f"{counts(results)}\n"),
         ("Interfaces", table),
@@ -62,7 +62,7 @@ def counts(results: SearchResults) -> str:
     return f"{text}. Score: {results.metric} of the test episodes after the last step. Intervals: 95 %, bootstrap."
 
 
-def summary(results: SearchResults) -> pandas.DataFrame:
+def search_summary(results: SearchResults) -> pandas.DataFrame:
     """A row per interface: how it does over configurations, and at its best."""
     rng = np.random.default_rng(0)
     digits = ".3f" if results.metric == SUCCESS else ",.0f"
@@ -83,7 +83,7 @@ def summary(results: SearchResults) -> pandas.DataFrame:
                 "best configuration": number,
                 "its score": f"{best.mean():{digits}} ({ends[0]:{digits}} .. {ends[1]:{digits}})",
                 "on": f"{len(best)} fresh seeds" if fresh else "the search's seeds",
-                f"P({OURS} better)": _improvement(results, interface, rng),
+                f"P({OUR_INTERFACE} better)": _improvement(results, interface, rng),
             }
         )
     return pandas.DataFrame(rows)
@@ -97,9 +97,9 @@ def _scores_of(results: SearchResults, interface: str, configuration: int, stage
 
 def _improvement(results: SearchResults, interface: str, rng: np.random.Generator) -> str:
     """The probability that ours beats an interface, with its interval, over the configurations that both have."""
-    if interface == OURS or OURS not in results.interfaces:
+    if interface == OUR_INTERFACE or OUR_INTERFACE not in results.interfaces:
         return "-"
-    tables = results.table(OURS), results.table(interface)
+    tables = results.table(OUR_INTERFACE), results.table(interface)
     both = tables[0].index.intersection(tables[1].index)
     if both.empty:
         return "no configuration in common"

@@ -13,7 +13,7 @@ from nht.recipes.run.metrics import SUCCESS, tested
 from nht.recipes.study.rows_file import COLUMNS, CORE_SECONDS, MAP_ERROR, read_rows
 from nht.recipes.study.scores import Scores
 
-OURS = "nht"
+OUR_INTERFACE = "nht"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SearchResults:
     def interfaces(self) -> list[str]:
         """In the order of the rows, ours first."""
         found = list(dict.fromkeys(self.rows["interface"]))
-        return sorted(found, key=lambda name: name != OURS)
+        return sorted(found, key=lambda name: name != OUR_INTERFACE)
 
     @property
     def parameters(self) -> list[str]:

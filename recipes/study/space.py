@@ -103,7 +103,7 @@ Space = dict[str, dict[str, dict[str, list[Any]]]]
 distribution, its values."""
 
 
-def draw(space: Space, seed: int, configuration: int, interface: str) -> dict[str, Value]:
+def draw_settings(space: Space, seed: int, configuration: int, interface: str) -> dict[str, Value]:
     """One configuration of an interface: a value for each of its hyperparameters.
 
     Every hyperparameter has a generator of its own, seeded by its name, the search's seed and the configuration's
@@ -131,7 +131,7 @@ def quantile(seed: int, configuration: int, name: str) -> float:
     return float(np.random.default_rng([seed, configuration, crc32(name.encode())]).random())
 
 
-def write_manifest(path: Path, settings: dict[str, Any]) -> None:
+def write_search_manifest(path: Path, settings: dict[str, Any]) -> None:
     """Write the search's manifest; one that is there already must be of the same search.
 
     Args:
@@ -143,13 +143,13 @@ def write_manifest(path: Path, settings: dict[str, Any]) -> None:
     """
     manifest = {"version": VERSION, "settings": settings}
     if path.exists():
-        _check_same(path, read_manifest(path), manifest)
+        _check_same(path, read_search_manifest(path), manifest)
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(manifest, indent=1))
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
-    """What ``write_manifest`` wrote: ``version`` and ``settings``. Raises ValueError on anything else."""
+def read_search_manifest(path: Path) -> dict[str, Any]:
+    """What ``write_search_manifest`` wrote: ``version`` and ``settings``. Raises ValueError on anything else."""
     manifest = read_json(path)
     known_entries(manifest, ("version", "settings"), str(path))
     entry(manifest, "version", str, str(path))
