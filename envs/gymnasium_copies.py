@@ -101,7 +101,7 @@ class GymnasiumCopy(ForeignCopy):
                 "the environment cannot be drawn: it has no MuJoCo model, and was not made with "
                 f"render_mode='rgb_array'; its render modes are {modes}."
             )
-        from nht.envs.rendering import OwnRenderer
+        from nht.envs.own_pictures import OwnRenderer
 
         return OwnRenderer(self.env.render, width, height, camera)
 

@@ -93,6 +93,6 @@ class TorchRLCopy(ForeignCopy):
         """
         if not callable(draw := getattr(self.env, "render", None)):
             raise RuntimeError(f"a {type(self.env).__name__} cannot be drawn: it has no method render().")
-        from nht.envs.rendering import OwnRenderer
+        from nht.envs.own_pictures import OwnRenderer
 
         return OwnRenderer(draw, width, height, camera)

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from nht.envs.rendering import coarse_shadows
+from nht.envs.offscreen import coarse_shadows
 from nht.envs.simulation import Simulation
 from nht.recipes.progress_bar import progress_bar
 from nht.recipes.run.evaluation import Evaluation, Policy, evaluate
