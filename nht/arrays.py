@@ -1,4 +1,4 @@
-"""Arrays of others, of whatever type and byte order, as tensors that torch computes with."""
+"""Arrays from elsewhere, of any type and byte order, as tensors that torch computes with."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDER: dict[str, type[np.generic]] = {
     "f16": np.float64,
     "f12": np.float64,
 }
-"""Types with which torch computes little or not at all, and what holds their values; a long double is rounded."""
+"""NumPy types that torch hardly supports, each with a type that holds its values; a long double is rounded."""
 
 
 def as_tensor(values: Tensor | ArrayLike, name: str) -> Tensor:

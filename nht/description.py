@@ -1,4 +1,4 @@
-"""What stands in a map's file beside its weights, as JSON: it makes an untrained twin, and people can read it."""
+"""The JSON description of a map in its file, beside the weights: people can read it, and it makes an untrained twin."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nht.reading import shortened
 
 
 def describe(map: ActionMap) -> dict[str, Any]:
-    """What whoever reads only the header learns of a map: JSON values, None where a number is infinite.
+    """The description of a map for the header of its file: JSON values, None where a number is infinite.
 
     Raises:
         TypeError: if an argument of its constructor cannot stand in a file.
@@ -86,7 +86,7 @@ def _as_it_is(value: Any) -> Any:
 
 
 def _core(map: ActionMap) -> dict[str, Any]:
-    """What a twin takes."""
+    """What ``twin`` needs to know about a map."""
     module, name = identity(type(map))
     positional = {"init_positional": [_encoded(value) for value in map.init_positional()]}
     return {

@@ -111,7 +111,7 @@ def _numbered(data: TensorDict, first: Tensor, number: Tensor | None) -> tuple[T
 
 
 def _outcome(data: TensorDictBase) -> TensorDictBase:
-    """Where rewards and flags are those that a step brought."""
+    """The part of the data that has the rewards and flags of each step."""
     following = data.get("next", None)
     found = isinstance(following, TensorDictBase) and any(
         name in following for name in ("reward", *EPISODE_FLAGS)
@@ -139,7 +139,7 @@ def _entry(data: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def _rows(value: Tensor) -> Tensor:
-    """A single number per transition becomes a row of one."""
+    """A column (T, 1) of one number per transition (T,); other shapes stay."""
     return value[:, None] if value.ndim == 1 else value
 
 

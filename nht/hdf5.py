@@ -70,7 +70,7 @@ def hdf5_episodes(
     episode_key: str | None = None,
     done_key: str | None = None,
 ) -> tuple[TensorDict, int]:
-    """What ``from_hdf5`` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
+    """The transitions of a file, their values not checked yet, and the number of episodes that are left out."""
     sources = context if isinstance(context, Mapping) else {key: key for key in context}
     needed: dict[tuple[str, ...], str] = {("actuation",): actuation_key}
     needed |= {("context", name): key for name, key in sources.items()}

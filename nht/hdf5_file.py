@@ -1,4 +1,4 @@
-"""HDF5 files of others: what is in the file is read, what lies outside it is refused by name.
+"""Reads HDF5 files from elsewhere: only what is in the file itself; a reference to another file is refused by name.
 
 An HDF5 file can name other files in three ways: external links, external storage, and virtual datasets. h5py follows
 all of them without a word.
@@ -23,7 +23,7 @@ HDF5_ERRORS = (OSError, ValueError, KeyError, RuntimeError, TypeError, MemoryErr
 """What h5py raises on files that are cut short or damaged."""
 
 HOPS = 16
-"""Soft links in a row before they are taken for a circle."""
+"""Number of soft links followed before they are taken for a circle."""
 
 TRUSTED_HDF5 = (
     "If you trust it, copy what it names into one file first: h5repack, or h5py's "
@@ -54,14 +54,14 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 class _RefusedError(Exception):
-    """Names what is wrong, to be told from what h5py raises."""
+    """An error of this module, which is told apart from h5py's own."""
 
 
 def find(file: Any, key: str, hops: int = 0) -> Any:
     """The dataset or group at a key, soft links within the file followed; None if there is none.
 
     Raises:
-        ValueError: through ``opened``, if the way leads out of the file or in a circle.
+        ValueError: through ``opened``, if links lead out of the file or in a circle.
     """
     h5py = import_h5py()
     found, parts = file["/"], [part for part in key.split("/") if part not in ("", ".")]
@@ -143,7 +143,7 @@ def _check_virtual(file: Any, dataset: Any, where: str, hops: int) -> None:
 
 
 def _check_written(dataset: Any, where: str, size: int) -> None:
-    """What was never written would be read as zeros."""
+    """Raise for values that were never written: they would be read as zeros."""
     if dataset.chunks is None:
         missing = dataset.id.get_storage_size() < size
     else:
@@ -187,7 +187,7 @@ def check_file(file: Any) -> None:
 
 
 def names(file: Any, at_most: int) -> list[str]:
-    """Keys of datasets in the file itself, the first ones of many."""
+    """Keys of the datasets in the file itself, the first ``at_most`` of them."""
     h5py, found = import_h5py(), []
 
     def note(name: str, entry: Any) -> bool | None:
@@ -200,7 +200,7 @@ def names(file: Any, at_most: int) -> list[str]:
 
 
 def available_memory() -> int:
-    """Bytes of memory that can be had."""
+    """Available memory in bytes."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -211,7 +211,7 @@ def available_memory() -> int:
 
 
 def import_h5py() -> ModuleType:
-    """h5py, or how to get it."""
+    """Import h5py; the ImportError says how to install it."""
     try:
         import h5py
     except ImportError as error:

@@ -72,7 +72,7 @@ class CAE(ActionMap):
         return self.decoder(context, action)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """The encoder's latent; of a Gaussian its mean."""
+        """The encoder's latent, which is the mean where the encoder gives a Gaussian."""
         return self.encoder(context, actuation)[..., : self.action_dim]
 
     def fit(self, batch: TensorDictBase) -> bool:

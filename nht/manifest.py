@@ -32,7 +32,7 @@ ENTRIES: dict[str, type | tuple[type, ...]] = {
     "versions": dict,
     "fingerprint": str,
 }
-"""Of a manifest; ``checksum``, over all of these, is missing in those of earlier versions."""
+"""Entries of a manifest and their types; earlier versions wrote no ``checksum``, which is over all others."""
 
 
 def manifest_of(
@@ -65,7 +65,7 @@ def manifest_of(
 
 
 def described(data: TensorDictBase) -> dict[str, Any]:
-    """What a manifest says of the data themselves."""
+    """The entries of a manifest that describe the data."""
     return {
         "episodes": len(torch.unique(data["episode"])),
         "transitions": len(data),
@@ -96,7 +96,7 @@ def _versions() -> dict[str, str]:
 
 
 def manifest_text(manifest: dict[str, Any]) -> str:
-    """What stands in the file of a manifest.
+    """The text of a manifest's file.
 
     Raises:
         TypeError: if its settings hold other values than JSON has.

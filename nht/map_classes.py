@@ -1,4 +1,4 @@
-"""Which class a map file means: by module and name, so that two classes of one name are never mistaken."""
+"""Finds the class that a map file names, by module and name, so that two classes of one name are not confused."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def find_by_name(name: str) -> type[ActionMap]:
 
 
 def _imported(module: str, name: str) -> list[type[ActionMap]]:
-    """The classes of this module and name: the one that stands there now, else all that were made there."""
+    """The classes of this module and name: the one that the module holds now, else all that it ever defined."""
     found = [kind for kind in _concrete() if (kind.__module__, kind.__qualname__) == (module, name)]
     current: object = sys.modules.get(module)
     for part in name.split("."):

@@ -1,9 +1,9 @@
-"""TensorDicts read without trust from folders of raw files, as ``TensorDict.memmap`` lays them out.
+"""Reads TensorDicts from untrusted folders of raw files, in the layout of ``TensorDict.memmap``.
 
 A folder has a ``meta.json``, which says type, shape and batch size, one ``key.memmap`` of raw values for each tensor,
-and one folder for each TensorDict inside. TensorDict's own reader believes the ``meta.json``: it unpickles what is
-marked as pickled, and lengthens files that are shorter than they should be. This one compares all sizes with the files
-first, maps privately, so that neither reading nor writing to a tensor can change a file, and unpickles nothing.
+and one folder for each TensorDict inside. TensorDict's own reader trusts the ``meta.json``: it unpickles what is marked
+as pickled, and lengthens files that are shorter than they should be. This one compares all sizes with the files first,
+maps privately, so that neither reading nor writing to a tensor can change a file, and unpickles nothing.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def file_name(key: str) -> str:
 def write_tensordict(data: TensorDictBase, folder: Path) -> None:
     """Write a TensorDict of tensors into a new folder, as ``TensorDict.memmap`` lays it out.
 
-    Written like any file: on a full disk it says so, where writing into mapped memory kills the process.
+    Files are written, not mapped: on a full disk this raises, where writing into mapped memory kills the process.
 
     Raises:
         OSError: if there is no room.

@@ -57,7 +57,7 @@ def from_minari(
 
 
 def left_out_observations(dataset: MinariDataset, context: Any) -> dict[str, list[str]]:
-    """For a manifest's settings: which observations are no arrays, where all were asked for. Empty if all are."""
+    """For a manifest's settings: the observations left out as no arrays, if all were asked for; else empty."""
     names = [] if context is not None else list(leaves_that_are_no_arrays(dataset.observation_space))
     return {"left_out_observations": names} if names else {}
 
@@ -76,7 +76,7 @@ def open_minari(dataset: MinariDataset | str | Path) -> MinariDataset:
 
 
 def _data_folder(dataset: str | Path) -> Path:
-    """Where the files of a dataset are, which is named by its id, its folder or the HDF5 file in it."""
+    """The ``data`` folder of a dataset, given by its id, its folder or the HDF5 file in it."""
     path = Path(dataset)
     folder = path.parent if path.is_file() else path
     for found in (folder, folder / FOLDER, datasets_root() / str(dataset) / FOLDER):

@@ -24,7 +24,7 @@ AnyArray = NDArray[Any]
 def minari_episodes(
     dataset: MinariDataset, context: Mapping[str, str] | Sequence[str] | None = None
 ) -> tuple[TensorDict, int]:
-    """What ``from_minari`` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
+    """The transitions of a dataset, their values not checked yet, and the number of episodes that are left out."""
     targets = context if context is None or isinstance(context, Mapping) else {name: name for name in context}
     with naming(dataset.storage.data_path):
         parts, lengths = [], []

@@ -1,4 +1,4 @@
-"""Folders of Minari datasets, looked at before Minari opens them.
+"""Checks the folder of a Minari dataset before Minari opens it.
 
 Minari itself runs code for a dataset that does not say its spaces: it makes the environment that the metadata name, by
 an entry point of the file's choice. It also follows HDF5's links into other files, and opens frames as whatever kind
@@ -31,7 +31,7 @@ TRUSTED_MINARI = (
     "nht.from_minari(minari.MinariDataset(folder)) or nht.from_minari(minari.load_dataset(id))"
 )
 DEEPEST = 32
-"""Spaces within spaces."""
+"""Largest depth of nested spaces."""
 
 
 def local_datasets() -> list[str]:
@@ -111,7 +111,7 @@ def _check_space(space: Any, where: str, depth: int) -> None:
 
 
 def _check_box(space: dict[str, Any], where: str) -> None:
-    """Bounds in full: Minari would blow a single number up to whatever shape the file says."""
+    """Check that all bounds are given: Minari would expand a single number to whatever shape the file says."""
     shape = entry(space, "shape", list, where)
     if not all(type(size) is int and size >= 0 for size in shape):
         raise ValueError(f"{where}: 'shape' must be a list of sizes, got {shortened(repr(shape), 60)}.")

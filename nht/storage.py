@@ -1,4 +1,4 @@
-"""A map in one safetensors file: the weights and, as JSON in the header, what it takes to rebuild the map.
+"""A map in one safetensors file: the weights and, as JSON in the header, what is needed to rebuild the map.
 
 Loading checks every part, never unpickles, and imports nothing that the caller has not allowed. The header can be read
 without this package: ``json.loads(safetensors.safe_open(path, "pt").metadata()["map"])``.
@@ -62,8 +62,8 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
 def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Sequence[str] = ()) -> ActionMap:
     """Read a map, ready to use: in eval mode, its parameters without gradients.
 
-    A class of your own is found if its module is imported, or is, or lies in, one of those in ``allow``, which are then
-    imported. Files of format version 1 load as they did; they clip actuations.
+    A class of your own is found if its module has been imported, or if ``allow`` names the module or a package that
+    holds it; then it is imported. Maps in files of format version 1 clip actuations.
 
     Args:
         path: of a file that ``save_map`` wrote.
@@ -167,7 +167,7 @@ def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
 
 
 def _check_description(map: ActionMap, description: dict[str, Any]) -> None:
-    """What the header says for people must be what the map does."""
+    """Check that the header's entries for people agree with the map."""
     for name in ("context_dim", "actuation_dim", "action_dim", "action_scale"):
         if description[name] != (actual := float(getattr(map, name))):
             raise ValueError(
@@ -176,7 +176,7 @@ def _check_description(map: ActionMap, description: dict[str, Any]) -> None:
 
 
 def _check_finite(tensors: dict[str, Tensor], untrained: dict[str, Any]) -> None:
-    """No NaN; infinities, as of bounds, only where the untrained map has some, too."""
+    """Refuse NaN anywhere, and infinities where the untrained map has none."""
     scale = tensors.get("action_scale")
     if scale is None or scale.ndim or not 0 < float(scale) < math.inf:
         raise ValueError(f"holds a map whose action_scale is {scale}; it must be a positive, finite number.")
