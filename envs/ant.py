@@ -98,7 +98,7 @@ class Ant(Locomotion):
         return sizes | {"observation": sizes["observation"] + forces}
 
     def observe(self) -> dict[str, Array]:
-        """Positions but x and y, velocities and contact forces; those of the driven joints."""
+        """Positions but x and y, velocities and contact forces; also positions and velocities of the driven joints."""
         observed = super().observe()
         if self.include_cfrc_ext_in_observation:
             parts = [observed["observation"], self.contact_force]

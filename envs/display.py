@@ -8,7 +8,7 @@ from typing import Any
 
 
 def display_answers(seconds: float = 2.0) -> bool:
-    """Whether somebody serves the display that ``DISPLAY`` names: often nobody does, over ssh, in tmux, under cron."""
+    """Whether a server answers at the display that ``DISPLAY`` names; over ssh, in tmux or under cron few do."""
     host, _, number = os.environ.get("DISPLAY", "").rpartition(":")
     screen = number.partition(".")[0]
     if not screen.isdecimal():

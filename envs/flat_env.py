@@ -24,11 +24,11 @@ from nht.envs.foreign_specs import check_specs
 from nht.envs.outcome import INFO_FLAGS
 
 UNSEEN = ("step_count",)
-"""What is no observation: TorchRL's own clock."""
+"""Keys that are no observations: TorchRL's own clock."""
 
 
 def flattened(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], ForeignCopy], name: str) -> FlatEnv:
-    """A copy with flat observations in float32, and the flags of every environment of ours.
+    """A copy with flat observations in float32, and the flags that all our environments have.
 
     Args:
         make: builds the copy, TorchRL's wrapper of batch size ``[]``.
@@ -62,7 +62,7 @@ def flattened(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], Foreig
 
 
 class FlatEnv(TransformedEnv):
-    """One copy as ``ForeignEnv`` steps it."""
+    """One copy of an environment, as ``ForeignEnv`` steps it."""
 
     copy_of: ForeignCopy
     """Its simulator."""
@@ -75,7 +75,7 @@ def _as_vector(key: str, dimensions: int) -> Transform:
 
 
 class OutcomeFlags(Transform):
-    """Adds the flags that every environment of ours has and this one lacks; they are never set."""
+    """Adds the flags that all our environments have and this one lacks; they are never set."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         unset = torch.zeros(*next_tensordict.batch_size, 1, dtype=torch.bool, device=next_tensordict.device)

@@ -26,7 +26,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     It truncates only if ``options`` has ``max_episode_steps``: ``gymnasium.make`` adds the task's time limit, or its
     own ``max_episode_steps`` in its place. None is the task's own limit.
 
-    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+    It can be copied and pickled; a copy is independent and goes on bit for bit like the original.
 
     Args:
         task: a key of ``nht.envs.TASKS``.

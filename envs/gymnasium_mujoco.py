@@ -94,7 +94,7 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
 
 
 def _sizes(name: str, keys: Sequence[str], options: dict[str, Any]) -> dict[str, int]:
-    """How long the entries of ``info`` are that a reset brings: of an environment of its own."""
+    """The lengths of the entries of ``info`` after a reset, from an environment made for this."""
     if not keys:
         return {}
     with closing(gymnasium.make(name, **options)) as env:

@@ -28,14 +28,14 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
     arrays with N rows: the flags ``success``, ``failure`` and ``diverged`` and the task's raw keys; a mask ``_key``
     beside each names the rows that are of this call. What is returned belongs to the caller.
 
-    A copy whose episode has ended is started anew as ``autoreset_mode`` says:
+    A copy whose episode has ended is reset as ``autoreset_mode`` says:
 
     - ``NEXT_STEP``: the next step ignores its action, resets it and gives the reward 0.
     - ``SAME_STEP``: at once. ``infos["final_obs"]`` and ``["final_info"]`` hold the last step of the episode.
     - ``DISABLED``: by ``reset(options={"reset_mask": mask})``, which leaves the other copies alone. The other modes
       take it, too.
 
-    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+    It can be copied and pickled; a copy is independent and goes on bit for bit like the original.
 
     Args:
         task: a key of ``nht.envs.TASKS``.
@@ -211,7 +211,7 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
 
 
 def _with_masks(values: Mapping[str, Any], rows: Flags) -> dict[str, Any]:
-    """The entries and, as Gymnasium has it, beside each of them a mask of the rows that have it."""
+    """The entries and, as in Gymnasium, beside each a mask of the rows that have it."""
     return dict(values) | {f"_{key}": rows.copy() for key in values}
 
 

@@ -18,9 +18,9 @@ BALL = ("ball_x", "ball_z", "ball_y")
 LINKS = ("upper_arm", "middle_arm", "lower_arm", "hand")
 TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch")
 CLOSE = 0.01
-"""Distance between ball and target that is worth the full reward [m]."""
+"""Distance between ball and target that earns the full reward [m]."""
 IN_HAND, IN_TARGET = 0.1, 0.1
-"""How many episodes start with the ball in the hand, and on its target."""
+"""Shares of the episodes that start with the ball in the hand, and on its target."""
 
 
 class BringBall(SuiteTask):
@@ -109,7 +109,7 @@ class BringBall(SuiteTask):
         }
 
     def _hand(self, qpos: Array, beyond: float = 0.0) -> tuple[Array, Array, Array]:
-        """Where the hand, or a point ``beyond`` it, is in x and z [m], and its turn about y [rad]; each ``(N,)``."""
+        """Position x and z [m] of the hand, or of a point ``beyond`` it, and its turn about y [rad], each ``(N,)``."""
         turn = -np.cumsum(qpos[:, self._arm], axis=1)
         reach = np.append(self._lengths[1:], beyond)
         return np.sin(turn) @ reach, self._lengths[0] + np.cos(turn) @ reach, turn[:, -1]

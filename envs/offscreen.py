@@ -21,7 +21,7 @@ _most_shadow: ContextVar[int | None] = ContextVar("_most_shadow", default=None)
 
 @contextmanager
 def coarse_shadows(width: int) -> Iterator[None]:
-    """Renderers that are opened within draw shadows no finer than ``width`` pixels: in software half of all the work.
+    """Within, renderers are opened with shadow maps of at most ``width`` pixels: in software they are half of the work.
 
     Models ask for shadow maps of up to 4,096 pixels a side; in small pictures a quarter of that looks the same.
     """
@@ -54,7 +54,7 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
 
 @contextmanager
 def _visual_settings(model: mujoco.MjModel, width: int, height: int) -> Iterator[None]:
-    """Within, the model asks for a buffer of just the picture's size, and for no finer shadows than are wanted."""
+    """Within, the model asks for a buffer of the picture's size, and for no finer shadows than are wanted."""
     screen, quality, most = model.vis.global_, model.vis.quality, _most_shadow.get()
     before = screen.offwidth, screen.offheight, quality.shadowsize
     screen.offwidth, screen.offheight = width, height
@@ -73,7 +73,7 @@ def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
 def _prefer_offscreen_platform() -> None:
     """Let MuJoCo render through EGL where no display answers and nothing else was asked for.
 
-    MuJoCo chooses at its import, often before anyone could tell it (TorchRL imports it), so it has to choose again.
+    MuJoCo chooses when it is imported, often before this package is (TorchRL imports it), so it has to choose again.
     """
     if sys.platform == "linux" and not os.environ.get("MUJOCO_GL") and not display_answers():
         os.environ["MUJOCO_GL"] = "egl"

@@ -1,4 +1,4 @@
-"""What a Gymnasium environment keeps in Python: generators, clocks, goals, the state of those without MuJoCo."""
+"""The state that a Gymnasium environment keeps in Python: generators, clocks, goals, and all of it without MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ CONSTANT = (
     *(types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type),
     *(gymnasium.Space, gymnasium.envs.registration.EnvSpec, np.dtype),
 )
-"""Kinds of attributes that steps do not change."""
+"""Types of attributes that steps do not change."""
 
 
 class PythonState:
     """The attributes of an environment, its wrappers, and the environments that it holds, as far as steps change them.
 
-    Saved are plain ones (numbers, text, arrays, and lists, sets and dicts of them) that are no longer what they were
-    when the environment was made: a saved state does not bring back the options of the environment that it came from.
+    It saves plain attributes (numbers, text, arrays, and lists, sets and dicts of them) that have changed since the
+    environment was made: so a saved state does not contain the options of its environment.
 
     Args:
-        env: just made: not reset before.
+        env: just made, not reset yet.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -35,7 +35,7 @@ class PythonState:
 
     @property
     def unknown(self) -> str:
-        """The attributes that are of kinds that cannot be saved, and what they are: ``""`` if there are none."""
+        """Names and types of the attributes that cannot be saved; ``""`` if there are none."""
         found = [
             f"{type(part).__name__}.{name} is a {type(value).__module__}.{type(value).__qualname__}"
             for _, part in self._parts()
@@ -47,7 +47,7 @@ class PythonState:
         return ", ".join(found)
 
     def state_dict(self) -> dict[str, Any]:
-        """By the place of each environment, what has changed since it was made, and its generator."""
+        """For each environment, by its place, the attributes changed since it was made, and its generator."""
         saved: dict[str, Any] = {}
         for place, part in self._parts():
             made = self._made.get(place, {})
@@ -78,7 +78,7 @@ class PythonState:
                 part.np_random.bit_generator.state = saved[place]["generator"]
 
     def _parts(self) -> Iterator[tuple[str, gymnasium.Env[Any, Any]]]:
-        """The environment, what it wraps, and what that holds, each once, by the attributes that lead there."""
+        """The environment, those that it wraps or that these hold, each once, by the attributes that lead there."""
         seen: set[int] = set()
         waiting = [("env", self._env)]
         while waiting:
@@ -95,7 +95,7 @@ class PythonState:
 
 
 def _assign(part: gymnasium.Env[Any, Any], name: str, value: Any) -> None:
-    """Set an attribute; an array that others may hold, too, gets new numbers instead."""
+    """Set an attribute; an array, to which others may refer, is overwritten in place."""
     there = vars(part).get(name)
     if (
         isinstance(there, np.ndarray)
@@ -141,7 +141,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def encoded(value: Any) -> Any:
-    """A plain value made of numbers, text, arrays and dicts alone: sequences become dicts that say what they were."""
+    """A plain value as numbers, text, arrays and dicts only: a sequence becomes a dict that names its type."""
     if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, np.generic):
@@ -156,7 +156,7 @@ def encoded(value: Any) -> Any:
 
 
 def decoded(saved: Any) -> Any:
-    """What ``encoded`` was given."""
+    """The value that ``encoded`` was given."""
     if not isinstance(saved, dict):
         return saved.copy() if isinstance(saved, np.ndarray) else saved
     ((kind, items),) = saved.items()

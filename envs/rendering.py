@@ -17,7 +17,7 @@ LINE = np.array([0.15, 0.35, 0.85, 0.9], dtype=np.float32)  # red, green, blue, 
 
 
 class Scene(Protocol):
-    """What is drawn: copies that share a model, each a row of one state array. ``BatchedTask`` is one."""
+    """Copies that share a model, each a row of one state array, such as a ``BatchedTask``: they can be drawn."""
 
     model: mujoco.MjModel
     state: Array
@@ -142,7 +142,7 @@ def _checked_camera(model: mujoco.MjModel, camera: str | int) -> str | int:
 
 
 def _draw_line(scene: mujoco.MjvScene, points: Array, width: float = 3.0) -> None:
-    """Add a line [pixels wide] to the scene; of more points than it has room for, the last ones."""
+    """Add a line [width in pixels] to the scene: through the last points if it has no room for all."""
     room = scene.maxgeom - scene.ngeom
     for start, end in list(pairwise(points))[-room:]:
         geom = scene.geoms[scene.ngeom]

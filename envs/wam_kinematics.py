@@ -21,7 +21,7 @@ QUARTER_TURNS = np.array([-1, 1, -1, 1, -1, 1, 0])
 D = np.array([0.0, 0.0, 0.55, 0.0, 0.3, 0.0, 0.18])
 """DH link offsets [m]; the last one reaches to the tool face."""
 ARM = Arm(tuple(A.tolist()), tuple((QUARTER_TURNS * math.pi / 2).tolist()), tuple(D.tolist()))
-"""The same, as the table of tasks knows it."""
+"""The same parameters as a record for the table of tasks."""
 
 JOINT_LOW = np.array([-2.6, -2.0, -2.8, -0.9, -1.24, -1.6, -3.0])
 """Lower joint limits [rad], the maker's; the wrist yaw is cut to +-1.24 as in the paper's tasks."""

@@ -79,7 +79,7 @@ def _value_of_version_1(value: Any) -> Any:
 
 
 def _as_it_is(value: Any) -> Any:
-    """Objects within arguments stood for dictionaries only."""
+    """An argument of format version 1, in which every JSON object was a dictionary, as it is written today."""
     if isinstance(value, dict):
         return {"dict": {key: _as_it_is(one) for key, one in value.items()}}
     return [_as_it_is(one) for one in value] if isinstance(value, list) else value

@@ -69,7 +69,7 @@ def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:
 
 
 def moments_of(dataset: MinariDataset, episode: EpisodeData) -> dict[str, AnyArray]:
-    """What was known at each moment of an episode of T steps, (T + 1, *shape) by name. Checks all shapes."""
+    """Observations and infos at the T + 1 moments of an episode, (T + 1, *shape) by name. Checks all shapes."""
     steps = len(episode)
     moments: dict[str, AnyArray] = {}
     for name, values, space in _leaves(episode.observations, dataset.observation_space, "observation"):
