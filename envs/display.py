@@ -8,7 +8,7 @@ from typing import Any
 
 
 def display_answers(seconds: float = 2.0) -> bool:
-    """Whether a server answers at the display that ``DISPLAY`` names; over ssh, in tmux or under cron few do."""
+    """Whether a server answers at the display that ``DISPLAY`` names; over ssh or under cron there may be none."""
     host, _, number = os.environ.get("DISPLAY", "").rpartition(":")
     screen = number.partition(".")[0]
     if not screen.isdecimal():

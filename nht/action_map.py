@@ -229,7 +229,7 @@ class ActionMap(nn.Module, ABC):
 
 
 def _marked(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Let no subclass wrap it again, and give it code of its own: compilers count their attempts by that."""
+    """Mark a method so that no subclass wraps it again, and copy its code object: compilers count attempts by it."""
     function = cast(FunctionType, method)
     function.__code__ = function.__code__.replace()
     setattr(function, WRAPPED, True)

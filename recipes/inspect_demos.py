@@ -1,4 +1,4 @@
-"""What demonstrations look like: a summary on the screen, and a figure.
+"""Shows demonstrations: a summary on the screen, and a figure.
 
 python -m nht.recipes.inspect_demos runs/demos-wam_wipe
 """
@@ -18,7 +18,7 @@ from nht.recipes.sections import SourceConfig
 
 
 def main(config: InspectDemos) -> None:
-    """Read, print the summary and draw the figure."""
+    """Read demonstrations, print the summary and draw the figure."""
     if not config.demos:
         raise ValueError("nothing to inspect: name the demonstrations, inspect_demos PATH.")
     if config.directions < 1:

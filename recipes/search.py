@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from nht.recipes.study.cluster import Cluster
 
 POLL = 5.0
-"""Seconds between two looks at runs that other processes are at."""
+"""Seconds between two checks of runs that other processes work on."""
 
 
 def main(config: Search) -> None:
-    """Draw, run what is not there yet, run the best again on fresh seeds, and say how it came out."""
+    """Draw configurations, do the runs that are missing, run the best again on fresh seeds, and print a summary."""
     search, folder = config.search, Path(config.folder).resolve()
     check_interfaces(search)
     demos = Path(config.demos.path or folder / "demos").resolve()
@@ -57,7 +57,7 @@ def main(config: Search) -> None:
 
 
 def record_demos(config: Search, folder: Path, demos: Path) -> None:
-    """Let the expert give the demonstrations that all runs share; of several processes one does it, others wait."""
+    """Record the expert's demonstrations, which all runs share; one of several processes does it, the others wait."""
     while not demos.exists():
         with claimed(folder / "claims" / "demos") as ours:
             if ours and not demos.exists():
@@ -68,7 +68,7 @@ def record_demos(config: Search, folder: Path, demos: Path) -> None:
 def tasks_of(
     jobs: Sequence[Job], missing: Sequence[Job], learners: int, cluster: Cluster, folder: Path
 ) -> Iterator[Job | Pack]:
-    """Have the missing runs done, one by one or in packs, and give each task back once it is."""
+    """Do the missing runs, one by one or in packs, and yield each task once it is done."""
     if learners == 1:
         yield from cluster.run(run_job, missing, folder)
         return
@@ -84,7 +84,7 @@ def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: EndedRun
         jobs: of one stage.
         folder: of the search.
         cluster: where they run.
-        ended: the rows of all runs that have, which grows.
+        ended: rows of all runs that have ended; new ones are added.
         learners: how many train together, at most.
     """
     ended |= {
@@ -109,7 +109,7 @@ def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: EndedRun
 
 @contextmanager
 def progress(jobs: Sequence[Job], folder: Path) -> Iterator[Callable[[EndedRuns], None]]:
-    """A bar over the runs of a stage."""
+    """A progress bar over the runs of a stage."""
     stage = jobs[0].stage
     # The mean rate, not the latest: runs of one configuration end together, and configurations differ.
     with progress_bar(len(jobs), f"{folder.name}, {stage}", "run", smoothing=0) as bar:

@@ -1,4 +1,4 @@
-"""What demonstrations are like, in numbers."""
+"""Statistics of demonstrations."""
 
 from __future__ import annotations
 

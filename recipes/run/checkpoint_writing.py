@@ -1,4 +1,4 @@
-"""Writing the file of a checkpoint, as ``checkpoint_file`` describes and reads it."""
+"""Writes the file of a checkpoint, which ``checkpoint_file`` describes and reads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
     """Write state dictionaries to a new file.
 
     Args:
-        file: not there yet.
+        file: path of a file that does not exist yet.
         parts: by name, dictionaries of tensors, arrays, numbers, text, lists, tuples and dictionaries.
 
     Raises:
@@ -87,7 +87,7 @@ def _about(value: Tensor) -> dict[str, Any]:
 
 
 def _write(archive: zipfile.ZipFile, name: str, content: bytes | Tensor) -> str:
-    """Write a member; its SHA-256."""
+    """Write a member and return its SHA-256."""
     view = raw(content) if isinstance(content, Tensor) else memoryview(content)
     digest = hashlib.sha256()
     with archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as member:

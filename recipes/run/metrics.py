@@ -5,7 +5,7 @@ from __future__ import annotations
 FRAMES, UPDATES, SECONDS = "frames", "updates", "seconds"
 SUCCESS, FAILURE, RETURN = "success", "failure", "return"
 OUTCOMES = (SUCCESS, FAILURE, RETURN)
-"""What an episode is judged by."""
+"""The outcomes of an episode."""
 DIVERGED, CLIPPED = "diverged", "clipped"
 
 
@@ -25,7 +25,7 @@ EVERY_RUN = (FRAMES, *TESTED, SECONDS)
 
 
 def check_outcome(name: str, given: str) -> None:
-    """Raise ValueError unless an outcome is one that runs are compared by.
+    """Raise ValueError unless runs can be compared by the outcome.
 
     Args:
         name: of the setting.

@@ -1,4 +1,4 @@
-"""State dictionaries as JSON and tensors beside it, in TorchRL's terms; what is read can only be plain values."""
+"""State dictionaries as JSON with tensors beside it, in TorchRL's format; reading gives plain values only."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEVICE = re.compile(r"cpu|(cuda|xpu|mps)(:\d{1,3})?")
 
 
 def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """A value in JSON, where tensors and arrays stand by the names under which they are put into ``tensors``."""
+    """A value as JSON, with a name for each tensor or array; these are put into ``tensors`` by name."""
     if isinstance(value, (Tensor, np.ndarray)):
         key = f"tensor_{len(tensors):08d}"
         tensors[key] = value.detach() if isinstance(value, Tensor) else torch.from_numpy(value.copy())
@@ -47,7 +47,7 @@ def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
 
 
 def decoded(node: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
-    """What ``encoded`` made, and TorchRL before it: plain values, lists, dictionaries, tensors and arrays only."""
+    """The value that ``encoded``, or TorchRL, wrote: plain values, lists, dictionaries, tensors and arrays only."""
     if not isinstance(node, dict):
         raise ValueError(f"{where}/state.json holds {shortened(repr(node), 60)} where an object should be.")
     kind = entry(node, "kind", str, where)
@@ -89,7 +89,7 @@ def _mapping(node: dict[str, Any], tensors: Mapping[str, Tensor], where: str) ->
 
 
 def _placed(tensor: Tensor, node: dict[str, Any], where: str) -> Tensor:
-    """On the device that it was saved from, if this machine has it."""
+    """The tensor on the device that it was saved from, if this machine has it."""
     device = entry(node, "device", str, where)
     if not DEVICE.fullmatch(device):
         raise ValueError(f"{where}/state.json names the unknown device {shortened(device, 60)!r}.")

@@ -19,9 +19,9 @@ EndedRuns = dict[str, pandas.DataFrame]
 
 
 def known_rows(folder: Path, retry_failed: bool) -> EndedRuns:
-    """What ``rows.csv`` has: with the manifest it is all that another machine needs to go on.
+    """The rows in ``rows.csv``: with the manifest they are all that another machine needs to continue the search.
 
-    With ``retry_failed``, runs that did not get to their end are forgotten.
+    With ``retry_failed``, runs that failed or diverged are dropped.
     """
     if not (folder / "rows.csv").exists():
         return {}

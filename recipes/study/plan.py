@@ -16,11 +16,11 @@ from nht.recipes.study.results import SearchResults
 from nht.recipes.study.space import draw_settings
 
 FIRST_FRESH_SEED = 100
-"""First seed of the runs of best configurations: the search's own count from 0."""
+"""First seed of the runs of best configurations; seeds of the search itself count from 0."""
 
 
 def check_interfaces(search: SearchConfig) -> None:
-    """Raise ValueError for an interface that does not exist, or not on the job."""
+    """Raise ValueError for an interface that does not exist, or that the task cannot have."""
     if not search.interfaces:
         raise ValueError(f"search.interfaces is empty: choose from {interfaces()}.")
     for interface in search.interfaces:
@@ -33,17 +33,17 @@ def check_interfaces(search: SearchConfig) -> None:
 
 
 def interfaces() -> list[str]:
-    """What may be compared: every kind of map, and raw actuation, which is the kind ``none``."""
+    """Names of the interfaces that may be compared: every kind of map, and ``raw``, which is the kind ``none``."""
     return ["raw", *(name for name in KINDS if name != "none")]
 
 
 def kind_of(interface: str) -> MapKind:
-    """The kind of map that an interface is."""
+    """The kind of map of an interface."""
     return find_kind("none" if interface == "raw" else interface)
 
 
 def search_jobs(search: SearchConfig, demos: Path) -> list[Job]:
-    """Every run of the search, those of all interfaces of one configuration and seed after each other."""
+    """Every run of the search, ordered by configuration, seed and interface."""
     return [
         make_job(search, demos, "search", interface, configuration, seed, search.total_frames)
         for configuration in range(search.configs)
@@ -72,7 +72,7 @@ def make_job(
     seed: int,
     frames: int,
 ) -> Job:
-    """One run: what a person would type."""
+    """One run: the overrides that a user would type."""
     parameters = draw_settings(search.space, search.seed, configuration, interface)
     told = dict(parameters)
     if "map.hidden_layers" in told:
@@ -96,13 +96,13 @@ def make_job(
 
 
 def check_settings(jobs: Sequence[Job], folder: Path) -> None:
-    """Raise ValueError if a recipe does not take what it would be told, before anything is run."""
+    """Raise ValueError if a recipe refuses its overrides, before anything is run."""
     for job in {job.interface: job for job in jobs}.values():
         schema = find_algorithm(job.recipe).schema
         configure(schema, job.recipe, [*job.overrides, f"run.folder={folder}"])
 
 
 def task_env(search: SearchConfig) -> Any:
-    """The configuration of the environment that all runs have."""
+    """The configuration of the environment, which all runs share."""
     schema = find_algorithm(search.recipe).schema
     return configure(schema, search.recipe, [f"env={search.env}", "map=none", *search.base]).env

@@ -1,4 +1,4 @@
-"""The report of a search: its raw rows, read, checked and told in tables, figures and a page."""
+"""The report of a search: tables, figures and a page from its raw rows."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from nht.recipes.study.scores import (
 )
 
 Sections = list[tuple[str | None, str | pandas.DataFrame]]
-"""Of the page: headings, and what stands below them."""
+"""Sections of the page: a heading, and the text or table below it."""
 
 
 def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
-    """Write figures (PNG, SVG), ``report.md`` and ``report.html``; the first table.
+    """Write figures (PNG, SVG), ``report.md`` and ``report.html``; returns the first table.
 
     The same rows give the same files, byte for byte.
     """
@@ -47,7 +47,7 @@ def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
 
 
 def counts(results: SearchResults) -> str:
-    """How much was run, in a sentence."""
+    """A sentence with the numbers of runs."""
     runs = results.stage("search")
     again = results.stage("best")
     text = (
@@ -63,7 +63,7 @@ def counts(results: SearchResults) -> str:
 
 
 def search_summary(results: SearchResults) -> pandas.DataFrame:
-    """A row per interface: how it does over configurations, and at its best."""
+    """The summary, a row per interface: scores over configurations, and of the best one."""
     rng = np.random.default_rng(0)
     digits = ".3f" if results.metric == SUCCESS else ",.0f"
     rows = []
@@ -181,7 +181,7 @@ tr { border-bottom: 1px solid #ddd } img { max-width: 100% } p { color: #555 }
 
 
 def _html(title: str, sections: Sections, figures: list[search_figures.Figure], out: Path) -> str:
-    """One file, pictures included."""
+    """The page as one file, with the figures embedded."""
     parts = [f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"]
     parts.append(f"<h1>{html.escape(title)}</h1>")
     for heading, content in sections:
