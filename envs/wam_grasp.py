@@ -156,7 +156,7 @@ def clearance(arm: ArmGeoms, placed: Placed) -> Array:
 
 
 def grasp_point(polar: Array, azimuth: Array) -> Array:
-    """Points ``(N, 3)`` [m] of the grasp sphere: ``polar`` from straight up, ``azimuth`` from away of the robot."""
+    """Points ``(N, 3)`` [m] of the grasp sphere: polar angle from straight up, azimuth from the far side."""
     direction = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
     return OBJECT_CENTRE + GRASP_RADIUS * np.stack(direction, axis=-1)
 
