@@ -90,7 +90,7 @@ class Record:
             FloatingPointError: if training has diverged, that of all learners.
         """
         outcomes = evaluate(self._envs.final_test if self.finished else self._envs.test, policy).each()
-        trained = self.statistics.take_each(self._ranks.sum)
+        trained = self.statistics.take(self._ranks.sum)
         rows = [
             found
             if isinstance(found, FloatingPointError)

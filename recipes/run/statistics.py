@@ -96,30 +96,26 @@ class TrainingStatistics:
         self._updates, self._episodes, self._steps = counts["updates"], counts["episodes"], counts["steps"]
         self._sums = defaultdict(float, saved.get("sums", {}))
 
-    def take(self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums) -> dict[str, float]:
-        """Return the means of the only learner and reset; NaN where nothing was counted.
+    def take(
+        self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
+    ) -> list[dict[str, float] | FloatingPointError]:
+        """Return the means of every learner and reset; NaN where nothing was counted.
 
         Args:
             add: adds up the sums of all processes that train together.
 
-        Raises:
-            FloatingPointError: if a loss is no longer finite: the networks are lost.
+        Returns:
+            a row of metrics for each learner; an error in its place if its losses are no longer finite.
         """
-        (row,) = self.take_each(add)
-        if isinstance(row, FloatingPointError):
-            raise row
-        return row
-
-    def take_each(
-        self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
-    ) -> list[dict[str, float] | FloatingPointError]:
-        """Return the means of every learner and reset; an error stands for a learner that diverged."""
         names = (SUCCESS, FAILURE, DIVERGED, CLIPPED, *self._losses)
         counted = (self._updates, self._episodes, self._steps, *(self._sums[name] for name in names))
         own = [torch.as_tensor(value, dtype=torch.float64).cpu() for value in counted]
         totals = add(torch.stack([value.expand(self._learners or 1) for value in own]))
         self._clear()
-        return [self._row(dict(zip(names, sums, strict=True)), *counts) for counts, sums in _split(totals)]
+        return [
+            self._row(dict(zip(names, sums, strict=True)), updates, episodes, steps)
+            for updates, episodes, steps, *sums in totals.T.tolist()
+        ]
 
     def _row(
         self, sums: dict[str, float], updates: float, episodes: float, steps: float
@@ -138,8 +134,3 @@ class TrainingStatistics:
             CLIPPED: sums[CLIPPED] / (steps or math.nan),  # steps with a motor at its limit
         }
         return row | {name: sums[name] / (updates or math.nan) for name in self._losses}
-
-
-def _split(totals: torch.Tensor) -> list[tuple[list[float], list[float]]]:
-    """For every learner the three counts, and the sums."""
-    return [(column[:3], column[3:]) for column in totals.T.tolist()]
