@@ -8,7 +8,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-Record = TypeVar("Record")
+Listed = TypeVar("Listed")
 
 
 @cache
@@ -17,7 +17,7 @@ def installed(group: str) -> dict[str, EntryPoint]:
     return {found.name: found for found in entry_points(group=group)}
 
 
-class Table(Mapping[str, Record]):
+class Table(Mapping[str, Listed]):
     """Records by name: ours, and those of installed packages.
 
     A name is looked up, in this order, among our own, among the entry points that installed packages declare, and as an
@@ -31,14 +31,14 @@ class Table(Mapping[str, Record]):
     """
 
     def __init__(
-        self, group: str, own: Mapping[str, Record | str], adopt: Callable[[str, Any], Record]
+        self, group: str, own: Mapping[str, Listed | str], adopt: Callable[[str, Any], Listed]
     ) -> None:
         self.group = group
         self._own = dict(own)
         self._adopt = adopt
-        self._known: dict[str, Record] = {}
+        self._known: dict[str, Listed] = {}
 
-    def __getitem__(self, name: str) -> Record:
+    def __getitem__(self, name: str) -> Listed:
         """The record of that name.
 
         Raises:
@@ -63,7 +63,7 @@ class Table(Mapping[str, Record]):
             "package.module:attribute."
         )
 
-    def own(self, name: str) -> Record | None:
+    def own(self, name: str) -> Listed | None:
         """Our record of that name, if it is one of ours; nothing is imported for it."""
         found = self._own.get(name)
         return None if isinstance(found, str) else found

@@ -104,7 +104,7 @@ def _configured(map: nht.ActionMap, settings: MapConfig) -> nht.ActionMap:
     return map
 
 
-def load_kind(settings: MapConfig) -> nht.ActionMap:
+def map_from_file(settings: MapConfig) -> nht.ActionMap:
     """The map in ``map.file``, which must be of ``map.kind``; corrections are added if asked for.
 
     The file's action scale holds unless ``map.action_scale`` is set. Files of format version 1 get the default scale of
@@ -150,7 +150,7 @@ def run_map(settings: Training, motors: int) -> nht.MapTraining:
     """
     map, env = settings.map, settings.env
     if map.file is not None:
-        loaded = load_kind(map)
+        loaded = map_from_file(map)
         said = find_kind(map.kind).context_keys or env.context_keys
         own = loaded.context_keys if loaded.context_dim else None
         if said is not None and own is not None and list(own) != list(said):
@@ -177,6 +177,6 @@ def number_of_actions(settings: Training, motors: int, context_dim: int) -> int:
     """
     map = settings.map
     if map.file is not None:
-        return load_kind(map).action_dim
+        return map_from_file(map).action_dim
     width = make_map(map, context_dim, motors, settings.seed, settings.env).action_dim
     return width if map.residual is None else width + motors

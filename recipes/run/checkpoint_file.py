@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nht.memmap_files import DTYPES, META, STORAGE, TENSORDICT_TYPE, file_name, raw
 from nht.reading import MAX_TEXT, checksum, entry, parse_json, plain_file, shortened
-from nht.recipes.run.state_json import decoded
+from nht.recipes.run.state_json import from_json
 
 FORMAT, FORMAT_VERSION = "torchrl.checkpoint", 1
 CHECKPOINT_MANIFEST = "manifest.json"
@@ -128,7 +128,7 @@ class CheckpointFile:
             for key, entry_ in about.items()
             if isinstance(entry_, dict)
         }
-        return decoded(self._json(f"{folder}/state.json"), tensors, where)
+        return from_json(self._json(f"{folder}/state.json"), tensors, where)
 
     def _tensor(self, name: str, about: dict[str, Any], where: str) -> Tensor:
         kind, shape = entry(about, "dtype", str, where), entry(about, "shape", list, where)

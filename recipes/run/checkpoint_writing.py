@@ -18,7 +18,7 @@ from torch import Tensor
 from nht.memmap_files import TENSORDICT_TYPE, raw
 from nht.reading import checksum
 from nht.recipes.run.checkpoint_file import CHECKPOINT_MANIFEST, CHUNK_BYTES, FORMAT, FORMAT_VERSION
-from nht.recipes.run.state_json import encoded
+from nht.recipes.run.state_json import as_json
 
 
 def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
@@ -39,7 +39,7 @@ def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
             folder = f"components/{number:04d}-{name}"
             tensors: dict[str, Tensor] = {}
             files: dict[str, bytes | Tensor] = {
-                "state.json": json.dumps(encoded(state, tensors), separators=(",", ":")).encode()
+                "state.json": json.dumps(as_json(state, tensors), separators=(",", ":")).encode()
             }
             about: dict[str, Any] = {key: _about(value) for key, value in tensors.items()}
             about |= {"shape": [], "device": "cpu", "_type": TENSORDICT_TYPE}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 FRAMES, UPDATES, SECONDS = "frames", "updates", "seconds"
 SUCCESS, FAILURE, RETURN = "success", "failure", "return"
-OUTCOMES = (SUCCESS, FAILURE, RETURN)
+EPISODE_OUTCOMES = (SUCCESS, FAILURE, RETURN)
 """The outcomes of an episode."""
 DIVERGED, CLIPPED = "diverged", "clipped"
 
@@ -19,7 +19,7 @@ def trained(outcome: str) -> str:
     return f"train_{outcome}"
 
 
-TESTED = tuple(map(tested, OUTCOMES))
+TESTED = tuple(map(tested, EPISODE_OUTCOMES))
 EVERY_RUN = (FRAMES, *TESTED, SECONDS)
 """Columns that every run has, whatever the algorithm."""
 

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
-LOOK_EVERY = 0.5
+PARENT_CHECK_EVERY = 0.5
 """Seconds between two checks whether the parent still lives."""
 
 
@@ -22,7 +22,7 @@ def follow(parent: int, then: Callable[[], object]) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(LOOK_EVERY)
+            time.sleep(PARENT_CHECK_EVERY)
         then()
 
     threading.Thread(target=watch, name="follow-parent", daemon=True).start()

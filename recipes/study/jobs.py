@@ -69,7 +69,7 @@ def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
     return f"{stage}/{interface}/{configuration:03d}-seed{seed}"
 
 
-ENDINGS = ("done", "failed", "diverged")
+STATUSES = ("done", "failed", "diverged")
 
 TRIES = 3
 """How often a run is started if its workers die, which is not the fault of its settings. It resumes each time."""
@@ -101,9 +101,9 @@ class Ending:
             return None
         record = read_json(file)
         known_entries(record, ("status", "reason", "core_seconds"), str(file))
-        if entry(record, "status", str, str(file)) not in ENDINGS:
+        if entry(record, "status", str, str(file)) not in STATUSES:
             raise ValueError(
-                f"{file}: 'status' must be one of {list(ENDINGS)}, got {shortened(record['status'], 60)!r}."
+                f"{file}: 'status' must be one of {list(STATUSES)}, got {shortened(record['status'], 60)!r}."
             )
         spent = record.get("core_seconds")
         if not (spent is None or (isinstance(spent, int | float) and 0 <= spent < math.inf)):

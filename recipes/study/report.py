@@ -21,7 +21,7 @@ from nht.recipes.study.scores import (
     resampled,
 )
 
-Sections = list[tuple[str | None, str | pandas.DataFrame]]
+PageSections = list[tuple[str | None, str | pandas.DataFrame]]
 """Sections of the page: a heading, and the text or table below it."""
 
 
@@ -35,7 +35,7 @@ def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
     title = title or f"Search on {', '.join(results.rows['env'].unique())}"
     figures = search_figures.draw_all(results, out)
     table = search_summary(results)
-    sections: Sections = [
+    sections: PageSections = [
         (None, f"{counts(results)}\n"),
         ("Interfaces", table),
         ("Failed runs", failures(results)),
@@ -152,7 +152,7 @@ def categories(results: SearchResults) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def _markdown(title: str, sections: Sections, figures: list[search_figures.Figure]) -> str:
+def _markdown(title: str, sections: PageSections, figures: list[search_figures.Figure]) -> str:
     parts = [f"# {title}\n"]
     for heading, content in sections:
         parts += [f"## {heading}\n"] if heading else []
@@ -180,7 +180,7 @@ tr { border-bottom: 1px solid #ddd } img { max-width: 100% } p { color: #555 }
 """
 
 
-def _html(title: str, sections: Sections, figures: list[search_figures.Figure], out: Path) -> str:
+def _html(title: str, sections: PageSections, figures: list[search_figures.Figure], out: Path) -> str:
     """The page as one file, with the figures embedded."""
     parts = [f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"]
     parts.append(f"<h1>{html.escape(title)}</h1>")

@@ -17,7 +17,7 @@ from nht.envs.wam_kinematics import forward_kinematics
 from nht.maps import ActionMap, LinearActionMap
 from nht.recipes.config import TrainMap
 from nht.recipes.data.recording import record_expert
-from nht.recipes.maps.interface import load_kind, trained_map
+from nht.recipes.maps.interface import map_from_file, trained_map
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.train import projection_error
 from nht.transforms import ActionMapTransform
@@ -192,8 +192,8 @@ def test_the_tool_follows_the_axes_of_a_map_trained_on_wam_wipe(tmp_path: Path) 
     corrected = nht.Residual(aligned, 0.1)
     for map in (aligned, corrected):  # what a run is told of its map's kind still holds
         file = nht.save_map(map, tmp_path / f"{type(map).__name__}.safetensors")
-        assert type(load_kind(MapConfig("nht", str(file), residual=0.1))) is nht.Residual
-    found = load_kind(MapConfig("nht", str(tmp_path / "Aligned.safetensors")))
+        assert type(map_from_file(MapConfig("nht", str(file), residual=0.1))) is nht.Residual
+    found = map_from_file(MapConfig("nht", str(tmp_path / "Aligned.safetensors")))
     assert type(found) is nht.Aligned
     assert torch.equal(found.action_scale, aligned.action_scale)
 
