@@ -112,7 +112,7 @@ class Ant(Locomotion):
     def set_state(
         self, qpos: Array, qvel: Array, rows: Rows | None = None, *, tolerance: float = 0.1
     ) -> None:
-        """As of every task; contact forces read 0 until the next step, as in Gymnasium after a reset."""
+        """Set states as every task does; contact forces read 0 until the next step, as after Gymnasium's reset."""
         super().set_state(qpos, qvel, rows, tolerance=tolerance)
         self._forget_last_step(np.arange(self.num_envs) if rows is None else rows)
 

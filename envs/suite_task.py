@@ -1,4 +1,4 @@
-"""What tasks of dm_control's suite on the batched engine have in common."""
+"""The base class of tasks of dm_control's suite on the batched engine."""
 
 from __future__ import annotations
 

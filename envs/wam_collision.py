@@ -81,7 +81,7 @@ class ArmGeoms:
         self._margin: Array = np.where(types == CYLINDER, 0.0, radius)[:, None]
 
     def place(self, joint_angle: Array) -> Placed:
-        """Where geoms and tool are at the joint angles ``(N, joints)`` [rad]."""
+        """Positions of geoms and tool at the joint angles ``(N, joints)`` [rad]."""
         cos, sin = np.cos(joint_angle.T), np.sin(joint_angle.T)
         placed = np.repeat(self._at_zero, len(joint_angle), axis=-1)
         for joint in reversed(range(len(self._moved))):

@@ -33,7 +33,7 @@ MAX_SPEED = 2.0
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the tool is and how the joints move it, for a batch of N postures."""
+    """Pose and Jacobians of the tool for a batch of N postures."""
 
     position: Array
     """Centre of the tool face [m], ``(N, 3)``."""
@@ -79,7 +79,7 @@ def forward_kinematics(joint_angle: Array) -> Pose:
 
 
 def tool_pose(joint_angle: Array) -> tuple[Array, Array]:
-    """Where the tool face is, without the joint axes: ``forward_kinematics`` at half the cost, for every step.
+    """Position and normal of the tool face, without the joint axes: half the cost of ``forward_kinematics``.
 
     Carries the centre of the face and its normal from the tool's frame to the world's, one joint after the other.
 

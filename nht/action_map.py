@@ -1,4 +1,4 @@
-"""What every action map is: from a low-dimensional action and a context to the actuation of the motors, and back."""
+"""The base class of action maps: from a low-dimensional action and a context to the actuation, and back."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class ActionMap(nn.Module, ABC):
     def decode(
         self, action: Tensor, context: Tensor, low: Tensor | None = None, high: Tensor | None = None
     ) -> Tensor:
-        """What a policy's action in [-1, 1]^k does: ``self(action_scale * action, context)``, saturated.
+        """The actuation for a policy's action in [-1, 1]^k: ``self(action_scale * action, context)``, saturated.
 
         Args:
             action: (*batch, k). Entries beyond 1 are taken as they are.

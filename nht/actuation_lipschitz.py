@@ -1,4 +1,4 @@
-"""What the certificate says of actuations (Eq. 22), within the motors' limits and at them.
+"""Lipschitz constants of actuations (Eq. 22), within the motors' limits and at them.
 
 Let L be the certificate of Q(c), L0 that of u0(c), and M the largest |a|. Unlimited actuations obey
 

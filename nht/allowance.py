@@ -12,7 +12,7 @@ SLACK = 2**24  # [bytes]
 
 
 class FarLargerError(ValueError):
-    """What a file describes takes far more memory than what it holds."""
+    """A file describes something that takes far more memory than the file holds."""
 
 
 class Allowance(TorchFunctionMode):

@@ -184,6 +184,6 @@ class LASER(CAE):
         return False
 
     def _change_unit(self) -> Tensor:
-        """What an output of the dynamics of 1 stands for, in units of the raw context, (context_dim,)."""
+        """The change of the raw context that an output of 1 of the dynamics stands for, (context_dim,)."""
         assert self.dynamics is not None
         return self.change_length * self.dynamics.context_std

@@ -171,7 +171,7 @@ class SVD(LinearActionMap):
             self.offset_model = LinearOffset(context_dim, actuation_dim)
 
     def basis(self, context: Tensor) -> Tensor:
-        """The same for every context."""
+        """The basis, which is the same for every context."""
         return self.frame.expand(*context.shape[:-1], -1, -1)
 
     @torch.no_grad()

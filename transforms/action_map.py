@@ -115,7 +115,7 @@ class ActionMapTransform(Attachment):
 
     @property
     def action_scale(self) -> Tensor:
-        """What a policy's action of 1 stands for, a scalar: the map's."""
+        """The map's action scale, a scalar: what a policy's action of 1 stands for."""
         return self.map.action_scale
 
     def train(self, mode: bool = True) -> ActionMapTransform:
