@@ -98,7 +98,7 @@ class Ant(Locomotion):
         return sizes | {"observation": sizes["observation"] + forces}
 
     def observe(self) -> dict[str, Array]:
-        """Positions but x and y, velocities and contact forces; those of the driven joints."""
+        """Positions but x and y, velocities and contact forces; also positions and velocities of the driven joints."""
         observed = super().observe()
         if self.include_cfrc_ext_in_observation:
             parts = [observed["observation"], self.contact_force]
@@ -112,7 +112,7 @@ class Ant(Locomotion):
     def set_state(
         self, qpos: Array, qvel: Array, rows: Rows | None = None, *, tolerance: float = 0.1
     ) -> None:
-        """As of every task; contact forces read 0 until the next step, as in Gymnasium after a reset."""
+        """Set states as every task does; contact forces read 0 until the next step, as after Gymnasium's reset."""
         super().set_state(qpos, qvel, rows, tolerance=tolerance)
         self._forget_last_step(np.arange(self.num_envs) if rows is None else rows)
 

@@ -1,4 +1,4 @@
-"""What a serial arm is made of, for whoever wants to know how its joints move its tool."""
+"""The geometry of a serial arm, from which its kinematics follow."""
 
 from __future__ import annotations
 

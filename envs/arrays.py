@@ -1,4 +1,4 @@
-"""The arrays that a row per copy stands in, and what the copies draw from."""
+"""Types of a task's arrays, which have a row per copy, and of its seeds."""
 
 from __future__ import annotations
 
@@ -14,4 +14,4 @@ Rows: TypeAlias = NDArray[np.intp]
 """Indices of copies."""
 
 Seed: TypeAlias = int | Sequence[int] | None
-"""Of one generator for all copies (None takes a seed that nobody else has), or of several for equal numbers of them."""
+"""One seed for all copies (None takes one from the operating system), or several, each for as many copies."""

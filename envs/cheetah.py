@@ -11,7 +11,7 @@ from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
 
 RUN_SPEED = 10.0
-"""Speed of the centre of mass that is worth the full reward [m/s]."""
+"""Speed of the centre of mass that earns the full reward [m/s]."""
 SETTLING_STEPS = 200
 """Simulation steps without control before an episode starts."""
 

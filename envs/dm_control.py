@@ -6,8 +6,7 @@ import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+from nht.envs.arrays import Array
 
 if TYPE_CHECKING:
     import torch
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
 
     from nht.envs.foreign import ForeignEnv
 
-Array = NDArray[np.float64]
 
 MISSING = (
     "tasks of dm_control need its package: pip install 'nht[dm_control]', and on Python 3.13 or newer, for which its "

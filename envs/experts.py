@@ -58,8 +58,8 @@ class WipeExpert(Expert):
 class GraspExpert(Expert):
     """Resolved-rate controller for WAMGrasp: around the object to the grasp point, while the face turns to the centre.
 
-    The tool follows a great circle about the object's centre while its distance from there goes over to that of the
-    grasp points, so that it never comes nearer than both ends are. Way and turn shrink in the same proportion: both
+    The tool follows a great circle about the object's centre while its distance from the centre changes to that of the
+    grasp points, so that it never comes nearer than both ends are. Distance and turn shrink in proportion, so that both
     end together. The joint velocity is the one of least norm.
 
     Args:
@@ -72,7 +72,7 @@ class GraspExpert(Expert):
     """
 
     TURN_LENGTH = 0.2
-    """What a radian of turn counts as [m]: the length of the hand."""
+    """The distance that a turn by one radian counts as [m]: the length of the hand."""
 
     def __init__(self, speed: float = 0.107, gain: float = 5.0) -> None:
         if not (speed > 0 and gain > 0):
@@ -97,7 +97,7 @@ class GraspExpert(Expert):
 def arc(start: Array, end: Array) -> Array:
     """The way from one unit vector to another, each ``(N, 3)``: a tangent at ``start``, as long as their angle [rad].
 
-    Between opposite vectors, where every way is as short, it is 0.
+    It is 0 between opposite vectors, where no way is the shortest.
     """
     cosine = (start * end).sum(axis=1, keepdims=True)
     across = end - cosine * start

@@ -21,14 +21,14 @@ from torchrl.envs.transforms import (
 
 from nht.envs.foreign_copies import ForeignCopy, longest
 from nht.envs.foreign_specs import check_specs
+from nht.envs.outcome import INFO_FLAGS
 
-FLAGS = ("success", "failure", "diverged")
 UNSEEN = ("step_count",)
-"""What is no observation: TorchRL's own clock."""
+"""Keys that are no observations: TorchRL's own clock."""
 
 
 def flattened(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], ForeignCopy], name: str) -> FlatEnv:
-    """A copy with flat observations in float32, and the flags of every environment of ours.
+    """A copy with flat observations in float32, and the flags that all our environments have.
 
     Args:
         make: builds the copy, TorchRL's wrapper of batch size ``[]``.
@@ -41,7 +41,7 @@ def flattened(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], Foreig
     env = make()
     check_specs(env, name)
     copy = simulator(env)
-    aside = {*FLAGS, *UNSEEN, *copy.aside}
+    aside = {*INFO_FLAGS, *UNSEEN, *copy.aside}
     keys = [key for key in env.observation_spec if key not in aside]
     shapes = {key: env.observation_spec[key].shape for key in (*keys, *copy.aside)}
     transforms: list[Transform] = [
@@ -62,7 +62,7 @@ def flattened(make: Callable[[], EnvBase], simulator: Callable[[EnvBase], Foreig
 
 
 class FlatEnv(TransformedEnv):
-    """One copy as ``ForeignEnv`` steps it."""
+    """One copy of an environment, as ``ForeignEnv`` steps it."""
 
     copy_of: ForeignCopy
     """Its simulator."""
@@ -75,11 +75,11 @@ def _as_vector(key: str, dimensions: int) -> Transform:
 
 
 class OutcomeFlags(Transform):
-    """Adds the flags that every environment of ours has and this one lacks; they are never set."""
+    """Adds the flags that all our environments have and this one lacks; they are never set."""
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         unset = torch.zeros(*next_tensordict.batch_size, 1, dtype=torch.bool, device=next_tensordict.device)
-        for name in FLAGS:
+        for name in INFO_FLAGS:
             if name not in next_tensordict:
                 next_tensordict[name] = unset.clone()
         return next_tensordict
@@ -90,7 +90,7 @@ class OutcomeFlags(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Register the flags: collectors drop what is not in the specs."""
         shape = (*observation_spec.shape, 1)
-        for name in FLAGS:
+        for name in INFO_FLAGS:
             if name not in list(observation_spec.keys()):
                 observation_spec[name] = Binary(
                     n=1, shape=shape, dtype=torch.bool, device=observation_spec.device

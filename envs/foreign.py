@@ -1,4 +1,4 @@
-"""Environments of other libraries, made into what the recipes ask for.
+"""Adapts environments of other libraries to what the recipes need.
 
 They are stepped by TorchRL's own wrappers, one copy after the other. What is added here: flat observations in float32,
 the flags ``success``, ``failure`` and ``diverged``, a batch dimension, and a way to save and draw the simulators.
@@ -28,13 +28,14 @@ class ForeignEnv(SerialEnv):
     """N copies of a single environment, stepped one after the other: batch size ``[N]``.
 
     Every observation is flat and in float32; ``"observation"`` is all of them side by side, in the order of the
-    environment. ``"success"`` is what the environment says of itself, if it does; ``"failure"`` and ``"diverged"``
-    are never set, unless the environment is one of ours. Actions come in float32, whatever precision the environment
-    takes them in.
+    environment. ``"success"`` comes from the environment, if it reports it; ``"failure"`` and ``"diverged"`` are never
+    set, unless the environment is one of ours. Actions come in float32, whatever precision the environment takes them
+    in.
 
-    Partial steps touch only the copies that ``"_step"`` names: the others show what they showed, with the reward 0.
+    Partial steps touch only the copies that ``"_step"`` names: the others return the same observation again, with the
+    reward 0.
 
-    It can be copied and pickled where ``task.can_resume``: what comes of it goes on bit for bit.
+    It can be copied and pickled where ``task.can_resume``; a copy goes on bit for bit like the original.
 
     Args:
         make: builds one copy, TorchRL's wrapper of batch size ``[]``.
@@ -139,7 +140,7 @@ def _restored(
     saved: dict[str, Any],
     shown: TensorDictBase | None,
 ) -> ForeignEnv:
-    """The environment that was copied or pickled."""
+    """Rebuild an environment that was copied or pickled."""
     env = ForeignEnv(make, simulator, num_envs, None, device, name)
     if shown is not None:
         env.reset()  # makes what an environment makes at its first reset

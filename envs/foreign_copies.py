@@ -22,15 +22,15 @@ class ForeignCopy(ABC):
     time_per_step: float
     """Simulated time of one environment step [s]."""
     max_episode_steps: float = math.inf
-    """Environment steps in an episode, or infinity: where the environment knows no limit, it gets one."""
+    """Environment steps in an episode; infinity where the environment has no limit, and then it gets one."""
     longest_episode: int | None = None
-    """That limit; None is ``LONGEST_EPISODE``."""
+    """The limit that it gets; None is ``LONGEST_EPISODE``."""
     reward_range: tuple[float, float] = (-math.inf, math.inf)
     """Smallest and largest reward of a step."""
     aside: Sequence[str] = ()
     """Observations that are not part of ``"observation"``."""
     resume_obstacle: str = ""
-    """Why the copy cannot be saved whole, a part of a sentence; ``""`` where it can."""
+    """Why the copy cannot be saved completely, as a clause; ``""`` where it can."""
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class ForeignCopy(ABC):
 
 
 class ForeignTask:
-    """What recipes ask of the simulators of all copies, a ``Simulation``; the counterpart of ``BatchedTask``."""
+    """The simulators of all copies as one ``Simulation``; the counterpart of ``BatchedTask``."""
 
     def __init__(self, copies: Sequence[ForeignCopy], observation_sizes: dict[str, int]) -> None:
         self.copies = list(copies)
@@ -68,7 +68,7 @@ class ForeignTask:
 
     @property
     def resume_obstacle(self) -> str:
-        """Why not, a part of a sentence; ``""`` where it does."""
+        """Why it does not, as a clause; ``""`` where it does."""
         return self.copies[0].resume_obstacle
 
     def state_dict(self) -> dict[str, Any]:

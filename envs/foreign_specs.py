@@ -1,4 +1,4 @@
-"""Which environments of others can be driven: flat, continuous actions and observations that are numbers."""
+"""Checks whether a foreign environment can be driven: it needs flat, continuous actions and numeric observations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NO_OBSERVATIONS = ("success", "failure", "diverged", "step_count")
 
 
 def check_specs(env: EnvBase, name: str) -> None:
-    """Look at the specs of one copy.
+    """Check the specs of one copy.
 
     Args:
         env: TorchRL's wrapper.

@@ -1,4 +1,4 @@
-"""How a free root and hinges move, as MuJoCo's Runge-Kutta integrator has it."""
+"""Integrates the motion of a free root and hinges as MuJoCo's Runge-Kutta integrator does."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from nht.envs.arrays import Array
 
 FOURTH_ORDER = int(mujoco.__version__.split(".")[0]) >= 4
-"""Whether orientations are integrated by Munthe-Kaas's method; MuJoCo 3 combines angular velocities as they are."""
+"""Whether MuJoCo integrates orientations by Munthe-Kaas's method; MuJoCo 3 adds angular velocities uncorrected."""
 
 
 def moved(q: Array, v: Array, time: float) -> Array:
@@ -22,16 +22,17 @@ def moved(q: Array, v: Array, time: float) -> Array:
 
 
 def stage_velocity(v: Array, way: Array, time: float, corrected: bool = FOURTH_ORDER) -> Array:
-    """What a stage of the Runge-Kutta method, reached by ``moved(q, way, time)``, adds to the velocities of the others.
+    """The velocity that a Runge-Kutta stage, reached by ``moved(q, way, time)``, contributes to the weighted sum.
 
-    Turns do not add up: at the end of a turn ``u`` the angular velocity ``w`` changes ``u`` itself by the inverse of
-    the exponential map's derivative, ``w + u x w / 2 + (1 - |u|/2 cot(|u|/2)) u x (u x w) / |u|^2`` (Munthe-Kaas 1998).
+    Rotations do not add up: at the end of a turn ``u`` the angular velocity ``w`` changes ``u`` itself by the inverse
+    of the exponential map's derivative, ``w + u x w / 2 + (1 - |u|/2 cot(|u|/2)) u x (u x w) / |u|^2`` (Munthe-Kaas
+    1998).
 
     Args:
         v: velocities ``(N, nv)`` at the stage, the angular ones in the root's frame.
         way: the constant velocities ``(N, nv)`` that led there.
         time: for how long [s].
-        corrected: whether that is done, as by MuJoCo 4; else ``v`` is given back.
+        corrected: whether to correct, as MuJoCo 4 does; else ``v`` is returned.
     """
     if not corrected:
         return v

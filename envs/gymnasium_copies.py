@@ -28,11 +28,11 @@ FRAME_RATE = 30.0
 
 
 class InfoReader(BaseInfoDictReader):
-    """Makes observations of entries of ``info``; TorchRL's own reader stumbles over Python's bools.
+    """Turns entries of ``info`` into observations; TorchRL's own reader fails on Python's bools.
 
     Args:
-        flags: those that are True or False; one that ``info`` lacks is False. ``"success"`` may be called
-            ``"is_success"`` there.
+        flags: entries that are True or False; one that ``info`` lacks is False. ``info`` may call ``"success"``
+            ``"is_success"``.
         entries: length of the others, numbers or vectors, by their key.
     """
 
@@ -52,13 +52,13 @@ class InfoReader(BaseInfoDictReader):
 
     @property
     def info_spec(self) -> dict[str, TensorSpec]:
-        """What is written."""
+        """The specs of the entries that are written."""
         flags = {name: Binary(n=1, shape=(1,), dtype=torch.bool) for name in self.flags}
         return flags | {name: Unbounded((size,), dtype=torch.float32) for name, size in self.entries.items()}
 
 
 class GymnasiumCopy(ForeignCopy):
-    """An environment without MuJoCo: it can be saved where all that it consists of are plain Python values.
+    """An environment without MuJoCo: it can be saved if it consists of plain Python values only.
 
     Args:
         env: TorchRL's ``GymEnv``.
@@ -101,7 +101,7 @@ class GymnasiumCopy(ForeignCopy):
                 "the environment cannot be drawn: it has no MuJoCo model, and was not made with "
                 f"render_mode='rgb_array'; its render modes are {modes}."
             )
-        from nht.envs.rendering import OwnRenderer
+        from nht.envs.own_pictures import OwnRenderer
 
         return OwnRenderer(self.env.render, width, height, camera)
 
@@ -164,7 +164,7 @@ def gymnasium_copy(env: EnvBase) -> GymnasiumCopy:
 
 
 def _time_per_step(core: gymnasium.Env[Any, Any]) -> float:
-    """Simulated time of a step [s]: what the environment says, or one that it holds, as mazes do; or its frame rate."""
+    """Simulated time of a step [s]: from the environment, one that it holds, as mazes do, or its frame rate."""
     for part in (core, *vars(core).values()):
         if isinstance(part, gymnasium.Env) and isinstance(dt := getattr(part, "dt", None), float):
             return dt

@@ -11,14 +11,13 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from nht.envs.outcome import INFO_FLAGS
 from nht.envs.pictures import Pictures
 from nht.envs.registry import make_task
 from nht.envs.simulation import DEFAULT_SIZE
 from nht.envs.task import BatchedTask
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"]}
-FLAGS = ("success", "failure", "diverged")
-"""What ``info`` says of a step, beside the task's raw keys."""
 
 
 class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -27,7 +26,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     It truncates only if ``options`` has ``max_episode_steps``: ``gymnasium.make`` adds the task's time limit, or its
     own ``max_episode_steps`` in its place. None is the task's own limit.
 
-    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+    It can be copied and pickled; a copy is independent and goes on bit for bit like the original.
 
     Args:
         task: a key of ``nht.envs.TASKS``.
@@ -75,7 +74,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.task.seed(seed)
         self.task.reset()
         observation, raw = self._observe()
-        return observation, raw | dict.fromkeys(FLAGS, False)
+        return observation, raw | dict.fromkeys(INFO_FLAGS, False)
 
     def step(
         self, action: NDArray[np.float32]
@@ -83,7 +82,7 @@ class GymnasiumEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Advance by one environment step with the actuation ``action`` ``(n,)``."""
         outcome = self.task.step(np.asarray(action, dtype=np.float64)[None])
         observation, raw = self._observe()
-        flags = {name: bool(getattr(outcome, name)[0]) for name in FLAGS}
+        flags = {name: bool(getattr(outcome, name)[0]) for name in INFO_FLAGS}
         reward = float(outcome.reward[0])
         return observation, reward, bool(outcome.terminated[0]), bool(outcome.truncated[0]), raw | flags
 

@@ -22,7 +22,7 @@ def gymnasium_id(task: str) -> str:
 def register() -> None:
     """Make every task of the table known to ``gymnasium.make`` and ``gymnasium.make_vec``, with its time limit.
 
-    Those of installed packages are not imported before they are made; their limit is the task's own.
+    Tasks of installed packages are imported only when they are made; their limit is the task's own.
     """
     for task in TASKS:
         if (name := gymnasium_id(task)) in registry:

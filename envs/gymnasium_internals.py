@@ -8,7 +8,7 @@ import gymnasium
 from gymnasium.wrappers import TimeLimit
 
 GENERATOR = "_np_random"
-"""The attribute behind ``gymnasium.Env.np_random``, None until that was asked for."""
+"""The attribute behind ``gymnasium.Env.np_random``; None until that is first read."""
 
 
 class EpisodeClock:

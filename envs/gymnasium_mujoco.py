@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torchrl.envs import EnvBase, GymEnv
 
-from nht.envs.flat_env import FLAGS
 from nht.envs.foreign import ForeignEnv
 from nht.envs.gymnasium_copies import GymnasiumCopy, InfoReader, NativeCopy, gymnasium_copy
+from nht.envs.outcome import INFO_FLAGS
 
 
 def make_gymnasium(
@@ -89,12 +89,12 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
         copy = gymnasium_copy(env)
     if isinstance(copy, NativeCopy):
         sizes = {key: size for key, size in copy.task.observation_sizes.items() if key != "observation"}
-        return env.set_info_dict_reader(InfoReader(FLAGS, sizes))
+        return env.set_info_dict_reader(InfoReader(INFO_FLAGS, sizes))
     return env.set_info_dict_reader(InfoReader(("success",), _sizes(name, info_keys, options)))
 
 
 def _sizes(name: str, keys: Sequence[str], options: dict[str, Any]) -> dict[str, int]:
-    """How long the entries of ``info`` are that a reset brings: of an environment of its own."""
+    """The lengths of the entries of ``info`` after a reset, from an environment made for this."""
     if not keys:
         return {}
     with closing(gymnasium.make(name, **options)) as env:

@@ -12,7 +12,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from nht.envs.arrays import Array, Flags
-from nht.envs.gymnasium_env import FLAGS, check_render_mode, metadata_of, spaces_of
+from nht.envs.gymnasium_env import check_render_mode, metadata_of, spaces_of
+from nht.envs.outcome import INFO_FLAGS
 from nht.envs.pictures import Pictures
 from nht.envs.registry import make_task
 from nht.envs.simulation import DEFAULT_SIZE
@@ -27,14 +28,14 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
     arrays with N rows: the flags ``success``, ``failure`` and ``diverged`` and the task's raw keys; a mask ``_key``
     beside each names the rows that are of this call. What is returned belongs to the caller.
 
-    A copy whose episode has ended is started anew as ``autoreset_mode`` says:
+    A copy whose episode has ended is reset as ``autoreset_mode`` says:
 
     - ``NEXT_STEP``: the next step ignores its action, resets it and gives the reward 0.
     - ``SAME_STEP``: at once. ``infos["final_obs"]`` and ``["final_info"]`` hold the last step of the episode.
     - ``DISABLED``: by ``reset(options={"reset_mask": mask})``, which leaves the other copies alone. The other modes
       take it, too.
 
-    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+    It can be copied and pickled; a copy is independent and goes on bit for bit like the original.
 
     Args:
         task: a key of ``nht.envs.TASKS``.
@@ -105,7 +106,7 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
             self.task.reset(np.flatnonzero(mask))
         self._ended = ~mask & (everyone if self._ended is None else self._ended)
         observations, raw = self._observe()
-        off = {name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS}
+        off = {name: np.zeros(self.num_envs, dtype=bool) for name in INFO_FLAGS}
         return observations, _with_masks(raw | off, mask)
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
@@ -127,7 +128,7 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
             self.task.reset(np.flatnonzero(resetting))
         rewards = np.where(resetting, 0.0, outcome.reward)
         terminations, truncations = outcome.terminated & ~resetting, outcome.truncated & ~resetting
-        flags = {name: getattr(outcome, name) & ~resetting for name in FLAGS}
+        flags = {name: getattr(outcome, name) & ~resetting for name in INFO_FLAGS}
         self._ended = terminations | truncations
         final = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
@@ -210,7 +211,7 @@ class GymnasiumVectorEnv(VectorEnv[Observations, NDArray[np.float32], NDArray[An
 
 
 def _with_masks(values: Mapping[str, Any], rows: Flags) -> dict[str, Any]:
-    """The entries and, as Gymnasium has it, beside each of them a mask of the rows that have it."""
+    """The entries and, as in Gymnasium, beside each a mask of the rows that have it."""
     return dict(values) | {f"_{key}": rows.copy() for key in values}
 
 

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class Locomotion(BatchedTask):
-    """Run along x: speed, less the cost of the actuation, and a reward for being healthy where one can fall.
+    """Run along x, for speed less the cost of the actuation, and for being healthy where one can fall.
 
     Actuation: the motors' controls ``(N, n)``, in [-1, 1]. Nothing counts as success; being unhealthy is the failure.
     An option that is None takes Gymnasium's default, which the class states.
@@ -51,9 +51,9 @@ class Locomotion(BatchedTask):
     gaussian_velocity: ClassVar[bool] = False
     """Start velocities are normal instead of uniform."""
     velocity_clip: ClassVar[float] = math.inf
-    """Observed velocities lie within this [m/s, rad/s]."""
+    """Observed velocities are clipped to this absolute value [m/s, rad/s]."""
     hidden: ClassVar[int] = 1
-    """This many coordinates, where on the floor the robot is, are not observed."""
+    """Number of coordinates that are not observed: the robot's place on the floor."""
 
     # Those who can fall have these as options.
     healthy_reward = 0.0
@@ -89,7 +89,7 @@ class Locomotion(BatchedTask):
         self.reset()
 
     def _prepare(self) -> None:
-        """Make what a subclass needs before the first reset."""
+        """Set up what a subclass needs before the first reset."""
 
     @property
     def observation_sizes(self) -> dict[str, int]:
@@ -112,7 +112,7 @@ class Locomotion(BatchedTask):
             self.qvel[rows] = self.rng.uniform(-noise, noise, (count, self.model.nv))
 
     def observe(self) -> dict[str, Array]:
-        """All positions but where on the floor, and velocities [m, rad, m/s, rad/s]; those of the driven joints."""
+        """Positions but those on the floor, and velocities [m, rad, m/s, rad/s]; also those of the driven joints."""
         clip = self.velocity_clip
         velocity = self.qvel if clip == math.inf else self.qvel.clip(-clip, clip)
         driven = self.model.nu
@@ -127,7 +127,7 @@ class Locomotion(BatchedTask):
         self._x_before = self._position().copy()
 
     def _position(self) -> Array:
-        """Where along x each copy stands [m], ``(N,)``: its change is the progress."""
+        """Position of each copy along x [m], ``(N,)``; its change is the progress."""
         return self.qpos[:, 0]
 
     def _judge(self, actuation: Array) -> tuple[Array, Flags, Flags, Flags]:
@@ -139,7 +139,7 @@ class Locomotion(BatchedTask):
         return reward, ended, np.zeros_like(healthy), ~healthy
 
     def _healthy(self) -> Flags:
-        """Which copies stand as they should, ``(N,)``."""
+        """Which copies are healthy, ``(N,)``."""
         return np.ones(self.num_envs, dtype=bool)
 
 

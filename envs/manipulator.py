@@ -12,15 +12,15 @@ from nht.envs.arrays import Array, Flags, Seed
 from nht.envs.dm_control import suite_module, tolerance
 from nht.envs.suite_task import SuiteTask
 
-ARM = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist")
+ARM_JOINTS = ("arm_root", "arm_shoulder", "arm_elbow", "arm_wrist")
 FINGERS = ("finger", "fingertip", "thumb", "thumbtip")
 BALL = ("ball_x", "ball_z", "ball_y")
 LINKS = ("upper_arm", "middle_arm", "lower_arm", "hand")
 TOUCH = ("palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch")
 CLOSE = 0.01
-"""Distance between ball and target that is worth the full reward [m]."""
+"""Distance between ball and target that earns the full reward [m]."""
 IN_HAND, IN_TARGET = 0.1, 0.1
-"""How many episodes start with the ball in the hand, and on its target."""
+"""Shares of the episodes that start with the ball in the hand, and on its target."""
 
 
 class BringBall(SuiteTask):
@@ -65,7 +65,8 @@ class BringBall(SuiteTask):
         )
         model = self.model
         self._arm, self._fingers, self._ball = (
-            np.array([model.joint(name).qposadr[0] for name in names]) for names in (ARM, FINGERS, BALL)
+            np.array([model.joint(name).qposadr[0] for name in names])
+            for names in (ARM_JOINTS, FINGERS, BALL)
         )
         self._touch = np.array([model.sensor(name).adr[0] for name in TOUCH])
         self._lengths = np.array([model.body(name).pos[2] for name in LINKS])
@@ -108,7 +109,7 @@ class BringBall(SuiteTask):
         }
 
     def _hand(self, qpos: Array, beyond: float = 0.0) -> tuple[Array, Array, Array]:
-        """Where the hand, or a point ``beyond`` it, is in x and z [m], and its turn about y [rad]; each ``(N,)``."""
+        """Position x and z [m] of the hand, or of a point ``beyond`` it, and its turn about y [rad], each ``(N,)``."""
         turn = -np.cumsum(qpos[:, self._arm], axis=1)
         reach = np.append(self._lengths[1:], beyond)
         return np.sin(turn) @ reach, self._lengths[0] + np.cos(turn) @ reach, turn[:, -1]

@@ -1,4 +1,4 @@
-"""MuJoCo models: compiled, and what states they allow."""
+"""Compiles MuJoCo models, and checks states for them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def load_model(path: Path) -> mujoco.MjModel:
 
 
 def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjModel:
-    """What ``build`` compiles.
+    """The model that ``build`` compiles.
 
-    MuJoCo's warnings go to the log, as mere information: the model is no work of whoever asks for it.
+    MuJoCo's warnings go to the log as information: whoever loads a model has not written it.
 
     Raises:
         ValueError: if it does not compile: the name, and MuJoCo's message.
@@ -36,11 +36,11 @@ def compile_model(name: str, build: Callable[[], mujoco.MjModel]) -> mujoco.MjMo
         with warnings_logged(logging.INFO, others=True):
             return build()
     except ValueError as error:
-        raise ValueError(f"{name} does not compile: {error}") from error
+        raise ValueError(f"{name} does not compile: {str(error).removesuffix('.')}.") from error
 
 
 def check_state(model: mujoco.MjModel, qpos: Array, qvel: Array, copies: int, tolerance: float) -> None:
-    """Check that a model can stand in states that come from outside.
+    """Check that states from outside are valid for a model.
 
     Args:
         model: the model.

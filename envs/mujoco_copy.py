@@ -1,4 +1,4 @@
-"""MuJoCo simulators of other libraries: saved whole, and drawn."""
+"""Saves and draws the MuJoCo simulators of other libraries."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Simulator:
         self.data = data
 
     def state_dict(self) -> dict[str, Any]:
-        """What the next step depends on.
+        """Everything that the next step depends on.
 
         ``"state"`` is what MuJoCo's own step reads. ``"derived"`` is what it left behind, poses, forces and sensors:
         after a step these belong to its last substep, and tasks read them before they take the next one.
@@ -46,7 +46,7 @@ class Simulator:
         """Go on from what ``state_dict`` returned.
 
         Raises:
-            ValueError: if that was of another model, or of a MuJoCo that keeps other numbers.
+            ValueError: if it is of another model, or of a MuJoCo version with another state.
         """
         for name, values in self._model_arrays().items():
             values[...] = saved["model"][name]
@@ -79,7 +79,7 @@ class Simulator:
         return [values for values in arrays if isinstance(values, np.ndarray) and values.dtype == np.float64]
 
     def _model_arrays(self) -> dict[str, NDArray[np.floating[Any]]]:
-        """What a task may change in its model when an episode starts: places, sizes, gains ..."""
+        """The arrays of the model that a task may change when an episode starts: positions, sizes, gains ..."""
         arrays = {name: getattr(self.model, name) for name in dir(self.model) if not name.startswith(FIXED)}
         return {
             name: values

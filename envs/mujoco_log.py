@@ -1,4 +1,4 @@
-"""MuJoCo's warnings, told to Python's logging: MuJoCo itself writes them to the console and into the working folder."""
+"""Sends MuJoCo's warnings to Python's logging: MuJoCo itself writes them to the console and into the working folder."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import mujoco
 LOGGER = logging.getLogger(__name__)
 NUMBER = re.compile(r"-?\d+(\.\d+)?([eE][+-]?\d+)?")
 _told: set[tuple[int, str]] = set()
-"""Of warnings that were told: at which level, and all but the numbers in them."""
+"""Warnings that were logged: the level, and the text without its numbers."""
 
 
 @contextmanager
 def warnings_logged(level: int = logging.WARNING, *, others: bool = False) -> Iterator[None]:
-    """Within, what MuJoCo warns of goes to this module's logger, and no ``MUJOCO_LOG.TXT`` is written.
+    """Within, MuJoCo's warnings go to this module's logger, and no ``MUJOCO_LOG.TXT`` is written.
 
     A diverging simulation warns at every step: of warnings that differ in their numbers only, the first is told.
     Serves as a decorator, too.
 
     Args:
         level: of the log's records.
-        others: whether this takes the place of a handler that somebody else gave MuJoCo, dm_control for one.
+        others: whether to replace a handler that another library gave MuJoCo, such as dm_control's.
     """
     previous = mujoco.get_mju_user_warning()
     if previous is not None and not others:

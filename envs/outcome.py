@@ -1,4 +1,4 @@
-"""What a step of N copies brought."""
+"""The result of one environment step of N copies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nht.envs.arrays import Array, Flags
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one environment step brought, a row per copy; every array is the caller's own.
+    """The result of one environment step, a row per copy; the caller owns the arrays.
 
     ``truncated`` is the time limit, ``terminated`` an end that belongs to the task; they are never merged.
     ``diverged`` marks copies whose actuation or physics was not finite: they failed and wait for a reset.
@@ -24,3 +24,6 @@ class Outcome:
 
 
 OUTCOME_FLAGS = ("terminated", "truncated", "success", "failure", "diverged")
+
+INFO_FLAGS = ("success", "failure", "diverged")
+"""Flags that Gymnasium's ``info`` and TorchRL's TensorDict have beside ``terminated`` and ``truncated``."""

@@ -14,9 +14,9 @@ View = tuple[int, int, str | int | None]
 
 
 class Pictures:
-    """Takes pictures of a simulation's copies; a renderer is made for every view that is asked for, and kept.
+    """Takes pictures of a simulation's copies; makes a renderer for every view that is asked for, and keeps it.
 
-    Copied or pickled, it starts without renderers.
+    A copied or pickled one starts without renderers.
 
     Args:
         task: what to look at.
@@ -49,6 +49,6 @@ class Pictures:
 
 
 def check_mode(mode: str) -> None:
-    """Raise ValueError for what is no way to render here."""
+    """Raise ValueError for a render mode other than ``"rgb_array"``."""
     if mode != "rgb_array":
         raise ValueError(f"mode must be 'rgb_array', got {mode!r}.")

@@ -1,4 +1,4 @@
-"""What a Gymnasium environment keeps in Python: generators, clocks, goals, the state of those without MuJoCo."""
+"""The state that a Gymnasium environment keeps in Python: generators, clocks, goals, and all of it without MuJoCo."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import numpy as np
 
 from nht.envs.gymnasium_internals import GENERATOR
 
-PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating, types.NoneType)
+PLAIN_TYPES = (bool, int, float, str, np.bool_, np.integer, np.floating, types.NoneType)
 CONSTANT = (
     *(types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type),
     *(gymnasium.Space, gymnasium.envs.registration.EnvSpec, np.dtype),
 )
-"""Kinds of attributes that steps do not change."""
+"""Types of attributes that steps do not change."""
 
 
 class PythonState:
     """The attributes of an environment, its wrappers, and the environments that it holds, as far as steps change them.
 
-    Saved are plain ones (numbers, text, arrays, and lists, sets and dicts of them) that are no longer what they were
-    when the environment was made: a saved state does not bring back the options of the environment that it came from.
+    It saves plain attributes (numbers, text, arrays, and lists, sets and dicts of them) that have changed since the
+    environment was made: so a saved state does not contain the options of its environment.
 
     Args:
-        env: just made: not reset before.
+        env: just made, not reset yet.
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -35,7 +35,7 @@ class PythonState:
 
     @property
     def unknown(self) -> str:
-        """The attributes that are of kinds that cannot be saved, and what they are: ``""`` if there are none."""
+        """Names and types of the attributes that cannot be saved; ``""`` if there are none."""
         found = [
             f"{type(part).__name__}.{name} is a {type(value).__module__}.{type(value).__qualname__}"
             for _, part in self._parts()
@@ -47,7 +47,7 @@ class PythonState:
         return ", ".join(found)
 
     def state_dict(self) -> dict[str, Any]:
-        """By the place of each environment, what has changed since it was made, and its generator."""
+        """For each environment, by its place, the attributes changed since it was made, and its generator."""
         saved: dict[str, Any] = {}
         for place, part in self._parts():
             made = self._made.get(place, {})
@@ -78,7 +78,7 @@ class PythonState:
                 part.np_random.bit_generator.state = saved[place]["generator"]
 
     def _parts(self) -> Iterator[tuple[str, gymnasium.Env[Any, Any]]]:
-        """The environment, what it wraps, and what that holds, each once, by the attributes that lead there."""
+        """The environment, those that it wraps or that these hold, each once, by the attributes that lead there."""
         seen: set[int] = set()
         waiting = [("env", self._env)]
         while waiting:
@@ -95,7 +95,7 @@ class PythonState:
 
 
 def _assign(part: gymnasium.Env[Any, Any], name: str, value: Any) -> None:
-    """Set an attribute; an array that others may hold, too, gets new numbers instead."""
+    """Set an attribute; an array, to which others may refer, is overwritten in place."""
     there = vars(part).get(name)
     if (
         isinstance(there, np.ndarray)
@@ -121,7 +121,7 @@ def _is_plain(value: Any) -> bool:
         return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
     if isinstance(value, list | tuple | set | frozenset):
         return all(_is_plain(each) for each in value)
-    return isinstance(value, PLAIN)
+    return isinstance(value, PLAIN_TYPES)
 
 
 def _copied(value: Any) -> Any:
@@ -141,7 +141,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def encoded(value: Any) -> Any:
-    """A plain value made of numbers, text, arrays and dicts alone: sequences become dicts that say what they were."""
+    """A plain value as numbers, text, arrays and dicts only: a sequence becomes a dict that names its type."""
     if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, np.generic):
@@ -150,13 +150,13 @@ def encoded(value: Any) -> Any:
         return {"dict": {key: encoded(each) for key, each in value.items()}}
     if isinstance(value, list | tuple | set | frozenset):
         items = sorted(value, key=repr) if isinstance(value, set | frozenset) else value
-        kind = type(value).__name__ if type(value) in KINDS.values() else "tuple"
+        kind = type(value).__name__ if type(value) in SEQUENCES.values() else "tuple"
         return {kind: {str(i): encoded(each) for i, each in enumerate(items)}}
     return value
 
 
 def decoded(saved: Any) -> Any:
-    """What ``encoded`` was given."""
+    """The value that ``encoded`` was given."""
     if not isinstance(saved, dict):
         return saved.copy() if isinstance(saved, np.ndarray) else saved
     ((kind, items),) = saved.items()
@@ -164,7 +164,7 @@ def decoded(saved: Any) -> Any:
         return np.asarray(items)[()]
     if kind == "dict":
         return {key: decoded(each) for key, each in items.items()}
-    return KINDS[kind](decoded(items[str(i)]) for i in range(len(items)))
+    return SEQUENCES[kind](decoded(items[str(i)]) for i in range(len(items)))
 
 
-KINDS: dict[str, type] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}
+SEQUENCES: dict[str, type] = {"list": list, "tuple": tuple, "set": set, "frozenset": frozenset}

@@ -24,14 +24,14 @@ GOLDEN = Path(__file__).parent / "assets" / "golden"
 
 @dataclass(frozen=True)
 class TaskRecord:
-    """What the table knows of a task. Classes may be given by their place, ``"module:Class"``, and are imported late.
+    """The record of a task. Classes may be given as import paths, ``"module:Class"``, and are imported when needed.
 
     Attributes:
         task: the ``BatchedTask``.
         expert: its scripted demonstrator, if it has one.
         arm: the arm that does it, if it is one whose joint angles are observed as ``"joint_angle"``.
         context_keys: the observations that an action map sees unless told otherwise.
-        gymnasium_id: None makes one of the name: ``"pour_tea"`` is ``"nht/PourTea-v0"``.
+        gymnasium_id: None derives one from the name: ``"pour_tea"`` is ``"nht/PourTea-v0"``.
         max_episode_steps: the task's time limit, for Gymnasium; None leaves it to the task itself.
         golden: JSON file with the first steps that tests compare with, if there is one.
     """
@@ -66,14 +66,14 @@ class TaskRecord:
 
     @property
     def endings(self) -> dict[str, bool]:
-        """The options that end an episode at success and at failure, as far as the task knows these."""
+        """The options that make an episode end at success and at failure, as far as the task has them."""
         return {
             name: True for name in ("terminate_on_success", "terminate_on_failure") if name in self.options
         }
 
     @property
     def has_success(self) -> bool:
-        """Whether the task has a notion of success: whether its episodes can end there."""
+        """Whether the task has a notion of success, that is, an option to end episodes there."""
         return "terminate_on_success" in self.endings
 
 
@@ -129,13 +129,13 @@ FOREIGN: Mapping[str, str] = {
     "gymnasium": "nht.envs.gymnasium_mujoco:make_gymnasium",
     "torchrl": "nht.envs.torchrl_env:make_torchrl",
 }
-"""Where the makers of other libraries' tasks are, by the name of the library."""
+"""Import paths of the functions that make other libraries' tasks, by the name of the library."""
 
 
 class UnknownOptionError(ValueError, TypeError):
-    """An option that does not exist: a bad value to whoever wrote a configuration, a TypeError to Python.
+    """An option that does not exist: a ValueError for users of configurations, and a TypeError for Python code.
 
-    TorchRL's ``GymEnv`` tries keywords of other environments and takes only Python's usual answer for a no.
+    TorchRL's ``GymEnv`` tries keywords of other environments and expects Python's usual TypeError as a refusal.
     """
 
 
@@ -156,7 +156,8 @@ def find_task(name: str) -> TaskRecord:
     try:
         return TASKS[name]
     except (ImportError, TypeError) as error:
-        raise ValueError(f"the environment {name!r} cannot be found: {error}") from error
+        reason = str(error).removesuffix(".")
+        raise ValueError(f"the environment {name!r} cannot be found: {reason}.") from error
 
 
 def make_task(name: str, **options: Any) -> BatchedTask:

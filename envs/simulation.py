@@ -1,4 +1,4 @@
-"""What the recipes ask of a simulation, whoever made it."""
+"""The protocol that the recipes need of a simulation."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ DEFAULT_SIZE = (640, 480)
 class Simulation(Protocol):
     """N copies of a task, behind an environment of TorchRL that has it as its ``task``.
 
-    ``BatchedTask`` and ``ForeignTask`` are simulations. Whoever brings an environment of another kind into the recipes
-    gives it a ``task`` with these members.
+    ``BatchedTask`` and ``ForeignTask`` are simulations. To use an environment of another kind in the recipes, give it a
+    ``task`` with these members.
     """
 
     @property
@@ -34,7 +34,7 @@ class Simulation(Protocol):
 
     @property
     def time_per_step(self) -> float:
-        """Simulated time of one environment step [s]: films run at the speed that it says."""
+        """Simulated time of one environment step [s]; it sets the speed of films."""
 
     @property
     def reward_range(self) -> tuple[float, float]:
@@ -42,11 +42,11 @@ class Simulation(Protocol):
 
     @property
     def can_resume(self) -> bool:
-        """Whether ``state_dict`` is all that later steps depend on, so that a loaded one goes on bit for bit."""
+        """Whether ``state_dict`` holds all that later steps depend on, so that a loaded one goes on bit for bit."""
 
     @property
     def resume_obstacle(self) -> str:
-        """Why it cannot, a part of a sentence; ``""`` where it can."""
+        """Why it does not, as a clause; ``""`` where it does."""
 
     def state_dict(self) -> dict[str, Any]:
         """Physics, episodes and generators, as far as they can be saved: numbers, text, arrays, and dicts of them."""
@@ -57,7 +57,7 @@ class Simulation(Protocol):
     def renderer(
         self, width: int = DEFAULT_SIZE[0], height: int = DEFAULT_SIZE[1], camera: str | int | None = None
     ) -> Renderer:
-        """Whatever takes pictures of the copies.
+        """A renderer that takes pictures of the copies.
 
         Args:
             width: of a picture [pixel].

@@ -1,4 +1,4 @@
-"""What tasks of dm_control's suite on the batched engine have in common."""
+"""The base class of tasks of dm_control's suite on the batched engine."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from nht.envs.task import BatchedTask
 class SuiteTask(BatchedTask):
     """A task of the suite: its model, its clock and rewards in [0, 1]; nothing counts as success or failure.
 
-    From equal states one step equals the suite's to 1e-9 in float64, where its solver starts as ours does: from no
-    guess of the accelerations. In the suite it goes on from the last step's, which changes a step by what the solver
-    leaves open. Whole episodes drift apart, since contacts are chaotic.
+    From equal states one step equals the suite's to 1e-9 in float64, if its solver starts without a guess of the
+    accelerations, as ours does. The suite's own solver starts from the last step's accelerations, which changes a step
+    by the solver's tolerance. Whole episodes drift apart, since contacts are chaotic.
 
     Args:
         name: domain and task, for messages.

@@ -8,37 +8,37 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-Record = TypeVar("Record")
+Listed = TypeVar("Listed")
 
 
 @cache
 def installed(group: str) -> dict[str, EntryPoint]:
-    """The entry points of installed packages by name, looked for once: all packages' files are read for it."""
+    """The entry points of installed packages by name; cached, as finding them reads the files of all packages."""
     return {found.name: found for found in entry_points(group=group)}
 
 
-class Table(Mapping[str, Record]):
+class Table(Mapping[str, Listed]):
     """Records by name: ours, and those of installed packages.
 
-    Looked up are, in this order, our own names, the names of the entry points that installed packages declare, and
-    import paths such as ``"my_package.tasks:POUR"``. Nothing is imported before it is looked up, so that a table costs
-    nothing, and every process finds the same by the same name.
+    A name is looked up, in this order, among our own, among the entry points that installed packages declare, and as an
+    import path such as ``"my_package.tasks:POUR"``. A record is imported only when it is looked up, so that a table
+    costs nothing, and every process finds the same by the same name.
 
     Args:
         group: of the entry points, e.g. ``"nht.tasks"``.
-        own: our records, or where each is: ``"module:attribute"``.
+        own: our records, or their import paths, ``"module:attribute"``.
         adopt: makes a record of what was found under a name; raises TypeError for what cannot become one.
     """
 
     def __init__(
-        self, group: str, own: Mapping[str, Record | str], adopt: Callable[[str, Any], Record]
+        self, group: str, own: Mapping[str, Listed | str], adopt: Callable[[str, Any], Listed]
     ) -> None:
         self.group = group
         self._own = dict(own)
         self._adopt = adopt
-        self._known: dict[str, Record] = {}
+        self._known: dict[str, Listed] = {}
 
-    def __getitem__(self, name: str) -> Record:
+    def __getitem__(self, name: str) -> Listed:
         """The record of that name.
 
         Raises:
@@ -63,7 +63,7 @@ class Table(Mapping[str, Record]):
             "package.module:attribute."
         )
 
-    def own(self, name: str) -> Record | None:
+    def own(self, name: str) -> Listed | None:
         """Our record of that name, if it is one of ours; nothing is imported for it."""
         found = self._own.get(name)
         return None if isinstance(found, str) else found
@@ -72,7 +72,7 @@ class Table(Mapping[str, Record]):
         return installed(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """All names, ours first; import paths are endless and left out."""
+        """All names, ours first; import paths are not listed."""
         return iter(dict.fromkeys([*self._own, *sorted(self._installed())]))
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class Table(Mapping[str, Record]):
 
 
 def imported(place: str) -> Any:
-    """What stands at ``"module:attribute"``.
+    """The object at an import path, ``"module:attribute"``.
 
     Raises:
         ImportError: if there is no such module, or nothing of that name in it.

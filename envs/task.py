@@ -46,7 +46,7 @@ class BatchedTask(BatchedPhysics, ABC):
     as success and failure. Quantities that differ between copies (goals, flags) live in arrays of the task, not
     in the model, so that all copies share one ``MjModel``.
 
-    A task can be copied and pickled: what comes of it goes on bit for bit, on its own.
+    A task can be copied and pickled; a copy is independent and goes on bit for bit like the original.
 
     Args:
         model: the compiled model, shared by all copies.
@@ -54,7 +54,7 @@ class BatchedTask(BatchedPhysics, ABC):
         substeps: simulation steps in one environment step.
         max_episode_steps: environment steps after which an episode is truncated.
         num_threads: native threads that share the copies; the result does not depend on it.
-        seed: seeds the generator that every random draw of the task comes from; None takes one that nobody else has.
+        seed: of the generator that every random draw of the task comes from; None takes one from the operating system.
 
     Raises:
         ValueError: if a count is below 1.
@@ -88,11 +88,11 @@ class BatchedTask(BatchedPhysics, ABC):
     def seed(self, seed: Seed) -> None:
         """Start the generator of all random draws anew; None takes a seed from the operating system.
 
-        Several seeds start a generator each, for equal numbers of copies in their order: what some draw does not depend
-        on the others.
+        Several seeds start a generator each, for equal numbers of copies in order; what one generator draws does not
+        depend on the others.
 
         Raises:
-            ValueError: if the copies cannot be shared alike.
+            ValueError: if the copies cannot be divided equally.
         """
         seeds = seed if isinstance(seed, Sequence) else [seed]
         if not seeds or self.num_envs % len(seeds):
@@ -153,12 +153,12 @@ class BatchedTask(BatchedPhysics, ABC):
     def step(self, actuation: NDArray[np.floating[Any]], rows: Rows | None = None) -> Outcome:
         """Advance the copies ``rows`` (all by default) by one environment step, and leave the others alone.
 
-        A copy that stands still keeps its state, its clock and the task's own arrays, and costs no simulation. It gets
-        the reward 0 and the flags of its last step.
+        A copy that is not stepped keeps its state, its clock and the task's own arrays, and costs no simulation. It
+        gets the reward 0 and the flags of its last step.
 
         Args:
-            actuation: ``(N, n)``, clipped to its bounds. A row that is not finite ends that copy's episode as a
-                failure and leaves the other copies alone. Rows of copies that stand still are not read.
+            actuation: ``(N, n)``, clipped to its bounds. A row that is not finite ends that copy's episode as a failure
+                and leaves the other copies alone. Rows of copies that are not stepped are not read.
             rows: indices of the copies to step.
 
         Raises:
@@ -181,7 +181,7 @@ class BatchedTask(BatchedPhysics, ABC):
         return self._conclude(applied, diverged)
 
     def _step_some(self, applied: Array, invalid: Flags, rows: Rows) -> Outcome:
-        """Step the copies ``rows``; what was written to the others on the way is taken back."""
+        """Step the copies ``rows``, and restore what was written to the others on the way."""
         still = np.ones(self.num_envs, dtype=bool)
         still[rows] = False
         if still.all():
@@ -204,7 +204,7 @@ class BatchedTask(BatchedPhysics, ABC):
         return Outcome(np.zeros(self.num_envs), *self._flags.T.copy())
 
     def _conclude(self, applied: Array, diverged: Flags) -> Outcome:
-        """What the step brought that the copies have made."""
+        """The outcome of the step that the copies have made."""
         self._note_diverged(diverged)
         reward, terminated, success, failure = self._judge(applied)
         flags = (
@@ -221,7 +221,7 @@ class BatchedTask(BatchedPhysics, ABC):
     def set_state(
         self, qpos: Array, qvel: Array, rows: Rows | None = None, *, tolerance: float = 0.1
     ) -> None:
-        """Put the copies ``rows`` (all by default) into states from outside; their episodes go on from there.
+        """Set the states of the copies ``rows`` (all by default); their episodes go on from there.
 
         Args:
             qpos: positions ``(len(rows), nq)`` in the model's order [m, rad].
@@ -261,7 +261,7 @@ class BatchedTask(BatchedPhysics, ABC):
             generator.bit_generator.state = state
 
     _episode_arrays: ClassVar[tuple[str, ...]] = ()
-    """Names of the subclass's own per-copy arrays, each with N rows: saved, and kept where a copy stands still."""
+    """Names of the subclass's own arrays, each with N rows: saved, and kept for copies that are not stepped."""
 
     def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
         """Add what the model does not hold (goals, marks) of copy ``row`` to a rendered scene."""

@@ -1,4 +1,4 @@
-"""Any environment of TorchRL with continuous actions, as copies for the recipes."""
+"""Adapts any environment of TorchRL with continuous actions to the recipes."""
 
 from __future__ import annotations
 
@@ -29,10 +29,9 @@ def make_torchrl(
 ) -> ForeignEnv:
     """Copies of an environment of TorchRL.
 
-    Its actions must be a vector of numbers under ``"action"``, its observations numbers, not nested. What TorchRL wraps
-    of Gymnasium and dm_control is saved as by ``make_gymnasium`` and ``make_dm_control``, unless transforms stand
-    around it; of others ``task.resume_obstacle`` says why not. They are drawn by their own ``render()``, if they have
-    one.
+    Its actions must be a vector of numbers under ``"action"``, its observations numbers, not nested. TorchRL's wrappers
+    of Gymnasium and dm_control are saved as by ``make_gymnasium`` and ``make_dm_control``, unless transforms surround
+    them; for others ``task.resume_obstacle`` says why not. They are drawn by their own ``render()``, if they have one.
 
     Args:
         factory: makes one copy, of batch size ``()``: a function, or an import path, ``"my_package.robots:make"``.
@@ -66,7 +65,7 @@ def _copy(env: EnvBase, longest_episode: int, time_per_step: float) -> ForeignCo
 
 
 class TorchRLCopy(ForeignCopy):
-    """An environment of which nothing is known but that TorchRL can step it: it is not saved.
+    """An environment that TorchRL can step, but that cannot be saved.
 
     Args:
         env: the environment.
@@ -79,7 +78,7 @@ class TorchRLCopy(ForeignCopy):
         self.time_per_step = time_per_step
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
+        """Empty: there is nothing that can be saved."""
         return {}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
@@ -93,6 +92,6 @@ class TorchRLCopy(ForeignCopy):
         """
         if not callable(draw := getattr(self.env, "render", None)):
             raise RuntimeError(f"a {type(self.env).__name__} cannot be drawn: it has no method render().")
-        from nht.envs.rendering import OwnRenderer
+        from nht.envs.own_pictures import OwnRenderer
 
         return OwnRenderer(draw, width, height, camera)

@@ -73,11 +73,11 @@ class WAMTask(BatchedTask):
 
     @abstractmethod
     def _violates(self) -> Flags:
-        """Whether the copies ``(N,)`` break a rule of the task where they are."""
+        """Which copies ``(N,)`` break a rule of the task in their present state."""
 
     @abstractmethod
     def _at_goal(self) -> Flags:
-        """Whether the tools ``(N,)`` are where they should be."""
+        """Which tools ``(N,)`` are at the goal."""
 
     @property
     def actuation_bounds(self) -> tuple[Array, Array]:
@@ -106,7 +106,7 @@ class WAMTask(BatchedTask):
         self._update_pose()
 
     def _observe_arm(self) -> dict[str, Array]:
-        """What every task shows by its own key: joint angles [rad], tool position and goal [m]."""
+        """The observations of every task with this arm: joint angles [rad], tool position and goal [m]."""
         return {
             "joint_angle": self.qpos.copy(),
             "tool_position": self._position.copy(),
@@ -114,7 +114,7 @@ class WAMTask(BatchedTask):
         }
 
     def _colour(self, row: int) -> tuple[float, float, float]:
-        """Of the goal of copy ``row``: orange, green once reached, red after a failure."""
+        """The colour of the goal of copy ``row``: orange, green once reached, red after a failure."""
         if self.failed[row]:
             return 0.85, 0.15, 0.15
         return (0.2, 0.7, 0.25) if self._at_goal()[row] else (0.95, 0.6, 0.1)
@@ -128,7 +128,7 @@ def check_positive(**settings: float) -> None:
 
 
 def brake(joint_angle: Array, velocity: Array) -> Array:
-    """The joint velocities ``(N, 7)`` without the components that press on towards a near joint limit."""
+    """The joint velocities ``(N, 7)`` without the components that move a joint further towards a near limit."""
     to_low = (joint_angle < BRAKE_LOW) & (velocity < 0)
     to_high = (joint_angle > BRAKE_HIGH) & (velocity > 0)
     return np.where(to_low | to_high, 0.0, velocity)

@@ -32,8 +32,8 @@ class ArmGeoms:
     """The spheres, capsules and cylinders that a serial arm of hinges moves, placed for N postures together.
 
     Every geom is a cylinder grown by a margin: a capsule's has no radius, a sphere's no length either, and a cylinder
-    has no margin. All are kept as they lie at joint angles 0, and a posture turns them about the joint axes as those
-    lie at joint angles 0, the last joint first (the product of exponentials). What no joint moves is left out.
+    has no margin. All are stored at joint angles 0; a posture turns them about the joint axes, also as at joint angles
+    0, the last joint first (product of exponentials). Geoms that no joint moves are left out.
 
     Args:
         model: every joint is a hinge, in a body below that of the joint before; the last one moves a site ``"tool"``.
@@ -81,7 +81,7 @@ class ArmGeoms:
         self._margin: Array = np.where(types == CYLINDER, 0.0, radius)[:, None]
 
     def place(self, joint_angle: Array) -> Placed:
-        """Where geoms and tool are at the joint angles ``(N, joints)`` [rad]."""
+        """Positions of geoms and tool at the joint angles ``(N, joints)`` [rad]."""
         cos, sin = np.cos(joint_angle.T), np.sin(joint_angle.T)
         placed = np.repeat(self._at_zero, len(joint_angle), axis=-1)
         for joint in reversed(range(len(self._moved))):

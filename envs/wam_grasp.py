@@ -156,7 +156,7 @@ def clearance(arm: ArmGeoms, placed: Placed) -> Array:
 
 
 def grasp_point(polar: Array, azimuth: Array) -> Array:
-    """Points ``(N, 3)`` [m] of the grasp sphere: ``polar`` from straight up, ``azimuth`` from away of the robot."""
+    """Points ``(N, 3)`` [m] of the grasp sphere: polar angle from straight up, azimuth from the far side."""
     direction = [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
     return OBJECT_CENTRE + GRASP_RADIUS * np.stack(direction, axis=-1)
 
@@ -177,8 +177,9 @@ def draw_grasp_points(rng: np.random.Generator, count: int) -> Array:
 def reachable_polar_angle() -> tuple[Array, Array]:
     """How far from straight up grasp points can be reached, by azimuth [rad]: the wrist pitch sets the limit.
 
-    From ``HOME`` the tool is led over the top of the object and down every meridian, degree by degree, until the
-    exact posture would collide or stand in a brake's zone. A degree is kept as a margin, for between the meridians.
+    From ``HOME`` the tool is led over the top of the object and down every meridian, degree by degree, until the exact
+    posture would collide or stand in a brake's zone. One degree is kept as a margin for what lies between the
+    meridians.
 
     Returns:
         azimuths and the largest polar angle on each, both ``(121,)``.

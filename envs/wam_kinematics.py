@@ -10,11 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nht.envs.arm import Arm
-
-Array = NDArray[np.float64]
+from nht.envs.arrays import Array
 
 A = np.array([0.0, 0.0, 0.045, -0.045, 0.0, 0.0, 0.0])
 """DH link lengths [m]."""
@@ -23,7 +21,7 @@ QUARTER_TURNS = np.array([-1, 1, -1, 1, -1, 1, 0])
 D = np.array([0.0, 0.0, 0.55, 0.0, 0.3, 0.0, 0.18])
 """DH link offsets [m]; the last one reaches to the tool face."""
 ARM = Arm(tuple(A.tolist()), tuple((QUARTER_TURNS * math.pi / 2).tolist()), tuple(D.tolist()))
-"""The same, as the table of tasks knows it."""
+"""The same parameters as a record for the table of tasks."""
 
 JOINT_LOW = np.array([-2.6, -2.0, -2.8, -0.9, -1.24, -1.6, -3.0])
 """Lower joint limits [rad], the maker's; the wrist yaw is cut to +-1.24 as in the paper's tasks."""
@@ -35,7 +33,7 @@ MAX_SPEED = 2.0
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the tool is and how the joints move it, for a batch of N postures."""
+    """Pose and Jacobians of the tool for a batch of N postures."""
 
     position: Array
     """Centre of the tool face [m], ``(N, 3)``."""
@@ -81,7 +79,7 @@ def forward_kinematics(joint_angle: Array) -> Pose:
 
 
 def tool_pose(joint_angle: Array) -> tuple[Array, Array]:
-    """Where the tool face is, without the joint axes: ``forward_kinematics`` at half the cost, for every step.
+    """Position and normal of the tool face, without the joint axes: half the cost of ``forward_kinematics``.
 
     Carries the centre of the face and its normal from the tool's frame to the world's, one joint after the other.
 

@@ -1,4 +1,4 @@
-"""What every action map is: from a low-dimensional action and a context to the actuation of the motors, and back."""
+"""The base class of action maps: from a low-dimensional action and a context to the actuation, and back."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-from nht.arguments import named_arguments, positional_arguments, recording
+from nht.arguments import named_arguments, positional_arguments, remembering_arguments
 from nht.networks import check_choice
 from nht.saturation import DEFAULT_SATURATION, Saturation, saturate
 from nht.widths import checked_forward, checked_project
@@ -28,23 +28,24 @@ class ActionMap(nn.Module, ABC):
     context takes one all the same; its last dimension may then be 0. Tensors of another last dimension are refused by
     ``forward`` and ``project``, whatever class overrides them.
 
-    ``forward`` and ``project`` are in the map's own, raw units. A policy's action is one in [-1, 1]^k: ``decode`` makes
-    an actuation of it, ``encode`` is the way back. What 1 stands for, ``action_scale``, and what happens at the motors'
-    limits, ``saturation``, belong to the map and stand in its file.
+    ``forward`` and ``project`` are in the map's own, raw units. A policy's action lies in [-1, 1]^k: ``decode`` turns
+    it into an actuation, ``encode`` does the reverse. Two settings belong to the map and are saved with it:
+    ``action_scale``, what an action of 1 means in raw units, and ``saturation``, what happens at the motors' limits.
 
-    A subclass is trained, saved and loaded like those of this package: what its constructor was given is remembered.
+    Subclasses are trained, saved and loaded like the maps of this package: the base class remembers the constructor's
+    arguments.
 
     Attributes:
         action_dim: k.
         actuation_dim: n.
         context_dim: width of the context.
-        context_keys: the entries that, side by side in this order, are the context. None until trained.
+        context_keys: keys of the entries that, concatenated in this order, are the context. None until trained.
         data_fingerprint: which demonstrations it was trained on. None until trained.
         action_scale: buffer, scalar: what a policy's 1 stands for. Training sets it to the largest |a_i| of the
             projected demonstrations, ``set_action_scale`` to anything else. 1 until then.
         actuation_low: buffer, (n,): the smallest demonstrated actuations. -infinity until trained.
         actuation_high: buffer, (n,): the largest ones. infinity until trained.
-        learns: whether demonstrations decide what the map does, not only its bounds.
+        learns: whether training changes what the map does, not only its bounds.
         needs_next_context: whether ``loss`` reads ("next", "context"), (batch, context_dim).
     """
 
@@ -61,7 +62,7 @@ class ActionMap(nn.Module, ABC):
         """Let every subclass remember its arguments and refuse wrong widths, whatever it overrides."""
         super().__init_subclass__(**kwargs)
         for name, wrap in (
-            ("__init__", recording),
+            ("__init__", remembering_arguments),
             ("forward", checked_forward),
             ("project", checked_project),
         ):
@@ -123,7 +124,7 @@ class ActionMap(nn.Module, ABC):
     def decode(
         self, action: Tensor, context: Tensor, low: Tensor | None = None, high: Tensor | None = None
     ) -> Tensor:
-        """What a policy's action in [-1, 1]^k does: ``self(action_scale * action, context)``, saturated.
+        """The actuation for a policy's action in [-1, 1]^k: ``self(action_scale * action, context)``, saturated.
 
         Args:
             action: (*batch, k). Entries beyond 1 are taken as they are.
@@ -162,9 +163,9 @@ class ActionMap(nn.Module, ABC):
         return self.project(actuation.to(scale.dtype), context.to(scale.dtype)) / scale
 
     def rest(self, context: Tensor) -> Tensor:
-        """The actuation of no action, from which ``saturation="scale"`` measures, (*batch, n): zero.
+        """The actuation (*batch, n) from which ``saturation="scale"`` measures: zero.
 
-        Affine maps have their offset u0(c) here. For a nonlinear map it is zero too, whatever its action 0 gives.
+        Affine maps return their offset u0(c). Nonlinear maps return zero, whatever they give for action 0.
         """
         return self.action_scale.new_zeros(*context.shape[:-1], self.actuation_dim)
 
@@ -202,9 +203,9 @@ class ActionMap(nn.Module, ABC):
     def init_args(self) -> dict[str, Any]:
         """The constructor's arguments by name: they make an untrained twin, ``type(map)(**map.init_args())``.
 
-        Of an argument that is kept as an attribute of its own name this is the attribute, else what was given. Only
-        numbers, text, None, lists and dictionaries of these, and other maps can stand in a file. What a constructor
-        takes by position alone, ``init_positional`` gives.
+        If the map has an attribute of the argument's name, that is the value, else what was given. Only numbers, text,
+        None, lists and dictionaries of these, and other maps can stand in a file. What a constructor takes by position
+        alone, ``init_positional`` gives.
         """
         return named_arguments(self, self._recorded_arguments)
 
@@ -214,9 +215,9 @@ class ActionMap(nn.Module, ABC):
 
     @torch.no_grad()
     def take_over(self, map: ActionMap) -> None:
-        """What another map learned about its demonstrations, its saturation, precision and device.
+        """Copy what another map learned about its demonstrations, and its saturation, precision and device.
 
-        For maps that wrap it.
+        For maps that wrap another map.
         """
         self.context_keys = map.context_keys
         self.data_fingerprint = map.data_fingerprint
@@ -228,7 +229,7 @@ class ActionMap(nn.Module, ABC):
 
 
 def _marked(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Let no subclass wrap it again, and give it code of its own: compilers count their attempts by that."""
+    """Mark a method so that no subclass wraps it again, and copy its code object: compilers count attempts by it."""
     function = cast(FunctionType, method)
     function.__code__ = function.__code__.replace()
     setattr(function, WRAPPED, True)

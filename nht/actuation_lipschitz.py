@@ -1,4 +1,4 @@
-"""What the certificate says of actuations (Eq. 22), within the motors' limits and at them.
+"""Lipschitz constants of actuations (Eq. 22), within the motors' limits and at them.
 
 Let L be the certificate of Q(c), L0 that of u0(c), and M the largest |a|. Unlimited actuations obey
 
@@ -72,7 +72,7 @@ def actuation_certificate(
 
 
 def _stretch(map: ActionMap, largest_action: float, low: Tensor | None, high: Tensor | None) -> float:
-    """S: by how much scaling into the limits may bring actuations apart."""
+    """S: the largest factor by which scaling into the limits can increase the distance between two actuations."""
     least, most = _rest_range(map)
     unlimited = torch.full((map.actuation_dim,), torch.inf, dtype=torch.float64)
     up = unlimited if high is None else torch.as_tensor(high).double().cpu().expand(map.actuation_dim)
@@ -116,7 +116,7 @@ def _rest_range(map: ActionMap) -> tuple[Tensor, Tensor]:
 
 
 def _basis_norm(map: ActionMap) -> float:
-    """A bound on |Q(c)|; of a Residual on that of the columns of its corrections beside it."""
+    """A bound on |Q(c)|; for a Residual, on the norm of Q(c) with the columns of its corrections appended."""
     if isinstance(map, Residual):
         return math.hypot(_basis_norm(map.map), map.scale)
     return map.basis_norm() if isinstance(map, LinearActionMap) else math.inf

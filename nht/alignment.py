@@ -1,7 +1,8 @@
 """A trained basis, turned so that its axes point where a person expects them to.
 
-What a basis spans is learned, its signs and its rotation within that span are left to chance. A policy does not mind;
-who steers by joystick does. A constant orthogonal matrix, found after training, puts it right.
+Training decides which subspace a basis spans; the signs of its axes and their rotation within the subspace are
+arbitrary. A policy does not mind, but a person with a joystick does. A constant orthogonal matrix, found after
+training, puts it right.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class Aligned(LinearActionMap):
     """Another map with its axes turned or mirrored: u = u0(c) + Q(c) R a, with one orthogonal R for all contexts.
 
     What the map spans, its offset, its projection error, its orthonormal columns, its certificate: none of them
-    changes, for R changes no length. ``action_scale`` is taken over, too; as a largest entry, that of the turned
+    changes, for R changes no length. ``action_scale`` is taken over, too, although the largest entry of the turned
     actions may be up to sqrt(k) times larger or smaller.
 
     There is nothing to learn: wrap a trained map, or let ``align`` do so. Its context keys, bounds and fingerprint are
@@ -61,15 +62,15 @@ class Aligned(LinearActionMap):
         return self.map.project(actuation, context) @ self.rotation
 
     def basis_norm(self) -> float:
-        """That of the map inside: R changes no length."""
+        """The norm of the wrapped map's basis: R changes no length."""
         return self.map.basis_norm()
 
     def rest(self, context: Tensor) -> Tensor:
-        """That of the map inside."""
+        """The rest of the wrapped map."""
         return self.map.rest(context)
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Refuse, for a basis that learns would turn again.
+        """Always raise: training the basis would undo the alignment.
 
         Raises:
             ValueError: always.
@@ -85,10 +86,10 @@ class Aligned(LinearActionMap):
 def align(map: ActionMap, directions: Tensor, context: Tensor, *, jacobian: Tensor | None = None) -> Aligned:
     """Turn the axes of a trained map towards given directions: orthogonal Procrustes.
 
-    Of all orthogonal matrices, reflections and sign flips among them, R is the one that brings the mean over the
-    contexts of |Q(c) R - D(c)|^2 to its least, entries squared and summed. Given the Jacobian of a tool, that of
-    |J(c) Q(c) R - D(c)|^2: action axis i then moves the tool along the i-th direction, as far as the map can. The
-    lengths of the directions weigh the axes and the contexts against each other.
+    R is the orthogonal matrix (a rotation, possibly with reflections) that minimises the mean over the contexts of
+    |Q(c) R - D(c)|^2, the sum of squared entries. With the Jacobian of a tool, it minimises that of |J(c) Q(c) R -
+    D(c)|^2: action axis i then moves the tool along the i-th direction, as far as the map can. The lengths of the
+    directions weigh the axes and the contexts against each other.
 
     Args:
         map: any linear map. One that is aligned already is aligned anew.

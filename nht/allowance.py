@@ -1,4 +1,4 @@
-"""How much memory a constructor may ask for: a file of two kilobytes could describe networks of any size."""
+"""Limits the memory that a constructor may allocate: a file of two kilobytes could describe networks of any size."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ SLACK = 2**24  # [bytes]
 
 
 class FarLargerError(ValueError):
-    """What a file describes takes far more memory than what it holds."""
+    """A file describes something that takes far more memory than the file holds."""
 
 
 class Allowance(TorchFunctionMode):
-    """While this is entered, tensors that are made out of nothing may not be much larger than a file's weights.
+    """A context manager within which new tensors may not be much larger than a file's weights.
 
-    ``FarLargerError`` is raised before the one too many is made.
+    ``FarLargerError`` is raised before the tensor that exceeds the limit is made.
 
     Args:
         size: of the weights that the file holds [bytes].

@@ -1,4 +1,4 @@
-"""What a map's constructor was given, so that a file can hold it and make the map's twin."""
+"""The arguments of a map's constructor: saved in the map's file, they make its untrained twin."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import nn
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.VAR_POSITIONAL)
 
 
-def recording(constructor: Callable[..., None]) -> Callable[..., None]:
-    """A constructor that remembers what the outermost one was given, in the attribute ``_recorded_arguments``."""
+def remembering_arguments(constructor: Callable[..., None]) -> Callable[..., None]:
+    """Let a constructor store the arguments of the outermost call in the attribute ``_recorded_arguments``."""
 
     @functools.wraps(constructor)
     def __init__(self: nn.Module, *args: Any, **kwargs: Any) -> None:  # noqa: N807 (tracebacks show this name)
@@ -53,11 +53,11 @@ def named_arguments(map: nn.Module, given: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments by name that, after those of ``positional_arguments``, make a twin of ``map``.
 
     Args:
-        map: an object that has been constructed; its attributes go before what was given.
+        map: an object that has been constructed; its attributes take precedence over what was given.
         given: from ``recorded``.
 
     Raises:
-        TypeError: if one is neither an attribute that can stand in a file nor was given as such.
+        TypeError: if an argument can be saved neither from an attribute nor as it was given.
     """
     named: dict[str, Any] = {}
     for parameter in _parameters(map)[_by_position(map) :]:
@@ -70,7 +70,7 @@ def named_arguments(map: nn.Module, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def positional_arguments(map: nn.Module, given: Mapping[str, Any]) -> tuple[Any, ...]:
-    """The arguments that can be given by position alone, and those before them; arguments and errors as above."""
+    """The values of positional-only arguments, and of those before them; arguments and errors as above."""
     values: list[Any] = []
     for parameter in _parameters(map)[: _by_position(map)]:
         if parameter.kind is inspect.Parameter.VAR_POSITIONAL:
@@ -91,7 +91,7 @@ def _by_position(map: nn.Module) -> int:
 
 
 def plain(value: Any) -> Any:
-    """A value as it can stand in a file: numpy's numbers become Python's; maps and tuples stay.
+    """A value that can be saved: numpy's numbers become Python's; maps and tuples stay as they are.
 
     Raises:
         TypeError: on anything but numbers, text, None, other maps, and lists and dictionaries of these.

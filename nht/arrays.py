@@ -1,4 +1,4 @@
-"""Arrays of others, of whatever type and byte order, as tensors that torch computes with."""
+"""Arrays from elsewhere, of any type and byte order, as tensors that torch computes with."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from nht.reading import shortened
+
 WIDER: dict[str, type[np.generic]] = {
     "u2": np.int32,
     "u4": np.int64,
@@ -16,7 +18,7 @@ WIDER: dict[str, type[np.generic]] = {
     "f16": np.float64,
     "f12": np.float64,
 }
-"""Types with which torch computes little or not at all, and what holds their values; a long double is rounded."""
+"""NumPy types that torch hardly supports, each with a type that holds its values; a long double is rounded."""
 
 
 def as_tensor(values: Tensor | ArrayLike, name: str) -> Tensor:
@@ -34,7 +36,7 @@ def as_tensor(values: Tensor | ArrayLike, name: str) -> Tensor:
     try:
         array: Any = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise ValueError(f"{name} is no array: {error}.") from None
+        raise ValueError(f"{name} is no array: {shortened(error)}.") from None
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} must hold numbers or truth values, got an array of type {array.dtype}.")
     kind = array.dtype.str[1:]

@@ -18,7 +18,7 @@ from nht.reading import shortened
 
 
 class Demos:
-    """Demonstrations, not to be changed: made by ``save_demos``, ``load_demos`` or one of the methods ``from_...``.
+    """Immutable demonstrations, made by ``save_demos``, ``load_demos`` or one of the methods ``from_...``.
 
     Attributes:
         buffer: replay buffer over all transitions, ``buffer.sample(256)``; nothing can be added to it.
@@ -78,8 +78,8 @@ class Demos:
         Args:
             data: (T,), or (N, T) with a trajectory in each row; in order of time, outcomes under "next".
             actuation_key: (*batch, n), what the motors got.
-            context: keys that may serve as context, or such keys by the names they get: `{"goal": ("info",
-                "goal")}`; those that also stand under "next" are taken along.
+            context: keys that may serve as context, or such keys by the names they get: ``{"goal": ("info",
+                "goal")}``; those that also stand under "next" are taken along.
             episode_key: integers that differ between episodes, where they are not "episode" or those of a
                 collector.
             done_key: true at an episode's last step, where it is not "done", "terminated" or "truncated".
@@ -174,6 +174,6 @@ def immutable_buffer(data: TensorDictBase) -> ReplayBuffer:
 
 
 def _named(values: Any, name: str) -> dict[str, Tensor]:
-    """Arrays by key, those of a context; a single one stands under "context"."""
+    """The arrays of a context, by key; a single array gets the key "context"."""
     given = values if isinstance(values, Mapping) else {"context": values}
     return {key: as_tensor(value, f"{name}, key {key!r}") for key, value in given.items()}

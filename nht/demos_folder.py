@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 
 from nht.demos import Demos, immutable_buffer
 from nht.episodes import items
-from nht.manifest import MANIFEST, described, manifest_of, manifest_text, read_manifest
+from nht.manifest import DEMOS_MANIFEST, described, manifest_of, manifest_text, read_manifest
 from nht.memmap import read_tensordict
 from nht.memmap_files import STORAGE, write_tensordict
 from nht.reading import shortened
@@ -72,7 +72,7 @@ def save_demos(
         (place / "data" / STORAGE).write_text(
             json.dumps({"metadata": {}, "is_pytree": False, "len": len(data)})
         )
-        (place / MANIFEST).write_text(text)
+        (place / DEMOS_MANIFEST).write_text(text)
         publish(place, path)
     return load_demos(path)
 

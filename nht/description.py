@@ -1,4 +1,4 @@
-"""What stands in a map's file beside its weights, as JSON: it makes an untrained twin, and people can read it."""
+"""The JSON description of a map in its file, beside the weights: people can read it, and it makes an untrained twin."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from nht.action_map import ActionMap
 from nht.arguments import plain
 from nht.lipschitz import certificate
 from nht.map_classes import find_by_name, find_class, identity
+from nht.reading import shortened
 
 
 def describe(map: ActionMap) -> dict[str, Any]:
-    """What whoever reads only the header learns of a map: JSON values, None where a number is infinite.
+    """The description of a map for the header of its file: JSON values, None where a number is infinite.
 
     Raises:
         TypeError: if an argument of its constructor cannot stand in a file.
@@ -50,7 +51,7 @@ def twin(description: dict[str, Any], allow: Sequence[str] = ()) -> ActionMap:
     try:
         map = kind(*positional, **named)
     except TypeError as error:
-        raise ValueError(f"holds arguments that {name} does not take: {error}.") from error
+        raise ValueError(f"holds arguments that {name} does not take: {shortened(error)}.") from error
     keys = description["context_keys"]
     if keys is not None:
         map.context_keys = tuple(_key(key) for key in keys)
@@ -78,14 +79,14 @@ def _value_of_version_1(value: Any) -> Any:
 
 
 def _as_it_is(value: Any) -> Any:
-    """Objects within arguments stood for dictionaries only."""
+    """An argument of format version 1, in which every JSON object was a dictionary, as it is written today."""
     if isinstance(value, dict):
         return {"dict": {key: _as_it_is(one) for key, one in value.items()}}
     return [_as_it_is(one) for one in value] if isinstance(value, list) else value
 
 
 def _core(map: ActionMap) -> dict[str, Any]:
-    """What a twin takes."""
+    """What ``twin`` needs to know about a map."""
     module, name = identity(type(map))
     positional = {"init_positional": [_encoded(value) for value in map.init_positional()]}
     return {

@@ -8,8 +8,8 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
-LISTED = 30  # keys that a message names
-FLAGS = ("terminated", "truncated", "done", "success")
+MOST_NAMES = 30  # keys that a message names
+EPISODE_FLAGS = ("terminated", "truncated", "done", "success")
 # TorchRL's data sets and its collectors number their episodes, and mark as false the padding of split ones.
 EPISODE_KEYS: tuple[NestedKey, ...] = ("episode", ("collector", "traj_ids"))
 MASK_KEYS: tuple[NestedKey, ...] = ("mask", ("collector", "mask"))
@@ -67,7 +67,7 @@ def whole_episodes(
         following = data.get(("next", *_parts(key)), None)
         if following is not None:
             laid_out["next", *_parts(name)] = _rows(following)
-    for name in ("reward", *FLAGS):
+    for name in ("reward", *EPISODE_FLAGS):
         if name in outcome:
             value = outcome[name].reshape(len(data), 1)
             laid_out[name] = value if name == "reward" else value.bool()
@@ -111,9 +111,11 @@ def _numbered(data: TensorDict, first: Tensor, number: Tensor | None) -> tuple[T
 
 
 def _outcome(data: TensorDictBase) -> TensorDictBase:
-    """Where rewards and flags are those that a step brought."""
+    """The part of the data that has the rewards and flags of each step."""
     following = data.get("next", None)
-    found = isinstance(following, TensorDictBase) and any(name in following for name in ("reward", *FLAGS))
+    found = isinstance(following, TensorDictBase) and any(
+        name in following for name in ("reward", *EPISODE_FLAGS)
+    )
     return following if found else data
 
 
@@ -121,7 +123,7 @@ def _done(data: TensorDictBase, outcome: TensorDictBase, done_key: NestedKey | N
     """Whether an episode ended, (T,), if the data say so."""
     if done_key is not None:
         return _entry(data, done_key).reshape(len(data)).bool()
-    flags = [outcome[name].reshape(len(data)).bool() for name in FLAGS[:3] if name in outcome]
+    flags = [outcome[name].reshape(len(data)).bool() for name in EPISODE_FLAGS[:3] if name in outcome]
     return torch.stack(flags).any(0) if flags else None
 
 
@@ -137,7 +139,7 @@ def _entry(data: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def _rows(value: Tensor) -> Tensor:
-    """A single number per transition becomes a row of one."""
+    """A column (T, 1) of one number per transition (T,); other shapes stay."""
     return value[:, None] if value.ndim == 1 else value
 
 
@@ -221,5 +223,5 @@ def key_name(key: NestedKey) -> str:
 def listed(data: TensorDictBase) -> str:
     """The keys, for messages; of many the first ones."""
     names = [repr(key) for key, _ in items(data)]
-    more = f" and {len(names) - LISTED:,} more" if len(names) > LISTED else ""
-    return ", ".join(names[:LISTED]) + more
+    more = f" and {len(names) - MOST_NAMES:,} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(names[:MOST_NAMES]) + more

@@ -36,8 +36,8 @@ def export_map(
     """Write what a policy's action in [-1, 1]^k does: ``map.decode(action, context, low, high)``.
 
     Inputs, in this order: "action" (batch, k) and "context" (batch, context_dim, which may be 0); output: "actuation"
-    (batch, n). All are in the map's precision, and for any batch. Without limits, what happens at the robot's is left
-    to whoever knows them.
+    (batch, n). All are in the map's precision, and for any batch. Without limits, the program does not limit the
+    actuation.
 
     - ``name.onnx``: for ONNX Runtime and other engines.
     - ``name.pt2``: for ``torch.export.load``.

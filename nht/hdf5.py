@@ -11,12 +11,13 @@ from tensordict import TensorDict
 from nht.arrays import as_tensor
 from nht.demos import Demos
 from nht.episodes import whole_episodes
-from nht.hdf5_file import import_h5py, names, opened, read
+from nht.hdf5_file import import_h5py, names, opened, read_array
 from nht.reading import naming, shown
 
 D4RL_CONTEXT: Mapping[str, str] = MappingProxyType({"observation": "observations"})
-OUTCOMES = {"reward": "rewards", "terminated": "terminals", "truncated": "timeouts"}  # ours: D4RL's, optional
-LISTED = 200  # keys that a message looks at, of which it shows some
+# Our names to D4RL's, which are optional.
+D4RL_OUTCOMES = {"reward": "rewards", "terminated": "terminals", "truncated": "timeouts"}
+MOST_KEYS = 200  # keys that a message looks at, of which it shows some
 ROBOMIMIC = (
     "Its layout is robomimic's: a group data/demo_N for every demonstration, which is not read. Put their arrays one "
     "after another and mark the last step of each, with h5py, or hand them to nht.Demos.from_tensors."
@@ -69,12 +70,12 @@ def hdf5_episodes(
     episode_key: str | None = None,
     done_key: str | None = None,
 ) -> tuple[TensorDict, int]:
-    """What ``from_hdf5`` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
+    """The transitions of a file, their values not checked yet, and the number of episodes that are left out."""
     sources = context if isinstance(context, Mapping) else {key: key for key in context}
     needed: dict[tuple[str, ...], str] = {("actuation",): actuation_key}
     needed |= {("context", name): key for name, key in sources.items()}
     needed |= {(name,): key for name, key in (("number", episode_key), ("end", done_key)) if key is not None}
-    optional: dict[tuple[str, ...], str] = {("next", name): key for name, key in OUTCOMES.items()}
+    optional: dict[tuple[str, ...], str] = {("next", name): key for name, key in D4RL_OUTCOMES.items()}
     optional |= {("next", "context", name): f"next_{key}" for name, key in sources.items()}
     data = _read(Path(path), needed, optional)
     with naming(path):
@@ -94,9 +95,9 @@ def _read(path: Path, needed: dict[tuple[str, ...], str], optional: dict[tuple[s
         raise FileNotFoundError(f"there is no file {path}.")
     wanted = {**needed, **optional}
     with opened(path) as file:
-        arrays = {name: read(file, name) for name in sorted(set(wanted.values()))}
+        arrays = {name: read_array(file, name) for name in sorted(set(wanted.values()))}
         missing = sorted(name for name in set(needed.values()) if arrays[name] is None)
-        present = names(file, LISTED) if missing else []
+        present = names(file, MOST_KEYS) if missing else []
     robomimic = any(name.startswith("data/demo_") for name in present)
     if missing:
         hint = f" {ROBOMIMIC}" if robomimic else ""

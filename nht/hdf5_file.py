@@ -1,4 +1,4 @@
-"""HDF5 files of others: what is in the file is read, what lies outside it is refused by name.
+"""Reads HDF5 files from elsewhere: only what is in the file itself; a reference to another file is refused by name.
 
 An HDF5 file can name other files in three ways: external links, external storage, and virtual datasets. h5py follows
 all of them without a word.
@@ -19,13 +19,16 @@ from numpy.typing import NDArray
 
 from nht.reading import plain_file, shortened
 
-UNREADABLE = (OSError, ValueError, KeyError, RuntimeError, TypeError, MemoryError, OverflowError)
+HDF5_ERRORS = (OSError, ValueError, KeyError, RuntimeError, TypeError, MemoryError, OverflowError)
 """What h5py raises on files that are cut short or damaged."""
 
 HOPS = 16
-"""Soft links in a row before they are taken for a circle."""
+"""Number of soft links followed before they are taken for a circle."""
 
-TRUST = "If you trust it, copy what it names into one file first: h5repack, or h5py's Group.copy(expand_external=True)."
+TRUSTED_HDF5 = (
+    "If you trust it, copy what it names into one file first: h5repack, or h5py's "
+    "Group.copy(expand_external=True)"
+)
 
 
 @contextmanager
@@ -44,21 +47,21 @@ def opened(path: Path) -> Iterator[Any]:
             yield file
     except _RefusedError as error:
         raise ValueError(str(error)) from None
-    except UNREADABLE as error:
+    except HDF5_ERRORS as error:
         raise ValueError(
             f"{path} cannot be read, it is cut short or no HDF5 file: {shortened(error)}."
         ) from error
 
 
 class _RefusedError(Exception):
-    """Names what is wrong, to be told from what h5py raises."""
+    """An error of this module, which is told apart from h5py's own."""
 
 
 def find(file: Any, key: str, hops: int = 0) -> Any:
     """The dataset or group at a key, soft links within the file followed; None if there is none.
 
     Raises:
-        ValueError: through ``opened``, if the way leads out of the file or in a circle.
+        ValueError: through ``opened``, if links lead out of the file or in a circle.
     """
     h5py = import_h5py()
     found, parts = file["/"], [part for part in key.split("/") if part not in ("", ".")]
@@ -72,7 +75,7 @@ def find(file: Any, key: str, hops: int = 0) -> Any:
             name = "/".join(parts[: place + 1])
             raise _RefusedError(
                 f"{file.filename}: {name!r} is a link to {link.path!r} in another file, {link.filename!r}, which is "
-                f"not followed. {TRUST}."
+                f"not followed. {TRUSTED_HDF5}."
             )
         if isinstance(link, h5py.SoftLink):
             if hops >= HOPS:
@@ -84,7 +87,7 @@ def find(file: Any, key: str, hops: int = 0) -> Any:
     return found
 
 
-def read(file: Any, key: str) -> NDArray[Any] | None:
+def read_array(file: Any, key: str) -> NDArray[Any] | None:
     """The array of the dataset at a key, which is all in this file; None if there is none.
 
     Raises:
@@ -93,25 +96,25 @@ def read(file: Any, key: str) -> NDArray[Any] | None:
     dataset = find(file, key)
     if not isinstance(dataset, import_h5py().Dataset):
         return None
-    check_dataset(file, dataset, key)
+    check_hdf5_dataset(file, dataset, key)
     try:
         return np.asarray(dataset[()])
-    except UNREADABLE as error:
+    except HDF5_ERRORS as error:
         raise _RefusedError(f"{file.filename}: {key!r} cannot be read: {shortened(error)}.") from error
 
 
-def check_dataset(file: Any, dataset: Any, key: str, hops: int = 0) -> int:
+def check_hdf5_dataset(file: Any, dataset: Any, key: str, hops: int = 0) -> int:
     """Check that all values of a dataset are in this file. Returns how many bytes of memory they take."""
     where = f"{file.filename}: {key!r}"
     try:
         shape, external, virtual = dataset.shape, dataset.external, dataset.is_virtual
-    except UNREADABLE as error:
+    except HDF5_ERRORS as error:
         raise _RefusedError(f"{where} cannot be read: {shortened(error)}.") from error
     if shape is None:
         raise _RefusedError(f"{where} holds no values.")
     if external:
         raise _RefusedError(
-            f"{where} keeps its values in another file, {external[0][0]!r}, which is not read. {TRUST}."
+            f"{where} keeps its values in another file, {external[0][0]!r}, which is not read. {TRUSTED_HDF5}."
         )
     if virtual:
         _check_virtual(file, dataset, where, hops)
@@ -131,16 +134,16 @@ def _check_virtual(file: Any, dataset: Any, where: str, hops: int) -> None:
     for source in dataset.virtual_sources():
         if source.file_name != ".":
             raise _RefusedError(
-                f"{where} is made of values in another file, {source.file_name!r}, which is not read. {TRUST}."
+                f"{where} is made of values in another file, {source.file_name!r}, which is not read. {TRUSTED_HDF5}."
             )
         inner = find(file, source.dset_name)
         if not isinstance(inner, h5py.Dataset) or hops >= HOPS:
             raise _RefusedError(f"{where} is made of {source.dset_name!r}, which is not there.")
-        check_dataset(file, inner, source.dset_name, hops + 1)
+        check_hdf5_dataset(file, inner, source.dset_name, hops + 1)
 
 
 def _check_written(dataset: Any, where: str, size: int) -> None:
-    """What was never written would be read as zeros."""
+    """Raise for values that were never written: they would be read as zeros."""
     if dataset.chunks is None:
         missing = dataset.id.get_storage_size() < size
     else:
@@ -174,7 +177,7 @@ def check_file(file: Any) -> None:
     def look_at_entry(name: str, entry: Any) -> None:
         nonlocal total
         if isinstance(entry, h5py.Dataset):
-            total += check_dataset(file, entry, name)
+            total += check_hdf5_dataset(file, entry, name)
 
     file.visititems(look_at_entry)
     if total > available_memory():
@@ -184,7 +187,7 @@ def check_file(file: Any) -> None:
 
 
 def names(file: Any, at_most: int) -> list[str]:
-    """Keys of datasets in the file itself, the first ones of many."""
+    """Keys of the datasets in the file itself, the first ``at_most`` of them."""
     h5py, found = import_h5py(), []
 
     def note(name: str, entry: Any) -> bool | None:
@@ -197,7 +200,7 @@ def names(file: Any, at_most: int) -> list[str]:
 
 
 def available_memory() -> int:
-    """Bytes of memory that can be had."""
+    """Available memory in bytes."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -208,7 +211,7 @@ def available_memory() -> int:
 
 
 def import_h5py() -> ModuleType:
-    """h5py, or how to get it."""
+    """Import h5py; the ImportError says how to install it."""
     try:
         import h5py
     except ImportError as error:

@@ -72,7 +72,7 @@ class CAE(ActionMap):
         return self.decoder(context, action)
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """The encoder's latent; of a Gaussian its mean."""
+        """The encoder's latent, which is the mean where the encoder gives a Gaussian."""
         return self.encoder(context, actuation)[..., : self.action_dim]
 
     def fit(self, batch: TensorDictBase) -> bool:
@@ -184,6 +184,6 @@ class LASER(CAE):
         return False
 
     def _change_unit(self) -> Tensor:
-        """What an output of the dynamics of 1 stands for, in units of the raw context, (context_dim,)."""
+        """The change of the raw context that an output of 1 of the dynamics stands for, (context_dim,)."""
         assert self.dynamics is not None
         return self.change_length * self.dynamics.context_std

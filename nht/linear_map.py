@@ -25,7 +25,7 @@ class LinearActionMap(ActionMap):
         actuation_dim: n.
         action_dim: k, in 1 ... n.
         lipschitz: Lipschitz constant that training keeps to, of Q(c) and, apart from it, of u0(c).
-        lipschitz_norm: the norm of the layers' matrices that is limited to this end.
+        lipschitz_norm: which norm of the layers' matrices is limited for it.
 
     Attributes:
         network: what turns the context into a description of the basis; None if the basis is always the same.
@@ -74,22 +74,23 @@ class LinearActionMap(ActionMap):
         return least_squares(self.basis(context), self.to_rest(actuation, context))
 
     def rest(self, context: Tensor) -> Tensor:
-        """u0(c), the actuation of no action, (*batch, n)."""
+        """u0(c), the actuation at action 0, (*batch, n)."""
         return super().rest(context) if self.offset_model is None else self.offset_model(context)
 
     def from_rest(self, way: Tensor, context: Tensor) -> Tensor:
-        """u0(c) plus a way (*batch, n): the actuation."""
+        """The actuation u0(c) + way, (*batch, n)."""
         return way if self.offset_model is None else self.offset_model(context) + way
 
     def to_rest(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """An actuation (*batch, n) less u0(c): its way from rest."""
+        """The way from rest to an actuation, u - u0(c), (*batch, n)."""
         return actuation if self.offset_model is None else actuation - self.offset_model(context)
 
     def offset_loss(self, way: Tensor) -> Tensor | float:
-        """What a contextual u0 is trained by, beside the loss: |u - u0(c)|^2, in its gradient but not in its value.
+        """An extra loss term that trains a contextual u0: it has the gradient of |u - u0(c)|^2 and the value 0.
 
-        The loss asks nothing of u0 within the span of Q(c), where an action does as much. Whatever Q(c) is, the mean of
-        the actuations, given the context, is a best u0 outside the span; within, it makes 0 the mean action.
+        The loss leaves u0 open within the span of Q(c), where an action has the same effect. The conditional mean of
+        the actuations, given the context, is an optimal u0 outside the span, whatever Q(c) is; within the span, it
+        makes the mean action 0.
 
         Args:
             way: u - u0(c), (batch, n).

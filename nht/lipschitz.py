@@ -35,9 +35,9 @@ def certificate(map: ActionMap) -> float:
     training kept to a limit or not.
 
     Returns:
-        Of a Residual the constant of the map inside, as corrections do not depend on the context; of an Aligned
-        the same, as its rotation changes no norm. 0 for a basis that ignores the context; infinity where none is
-        known, as for a map that is not linear in the action.
+        The constant of the wrapped map for a Residual, whose corrections do not depend on the context, and for an
+        Aligned, whose rotation changes no norm. 0 for a basis that ignores the context; infinity where none is known,
+        as for a map that is not linear in the action.
     """
     if isinstance(map, Aligned | Residual):
         return certificate(map.map)
@@ -68,8 +68,8 @@ def offset_certificate(map: ActionMap) -> float:
 class LipschitzProjection:
     """Keeps a map within its ``lipschitz`` limit by scaling down its layers (Gouk et al., 2018).
 
-    The limit is that of Q(c), and that of u0(c) where a network gives it: u0 counts like a column more, of an action
-    that is always 1. Actuations of actions up to M then have the constant lipschitz (M + 1).
+    The limit is that of Q(c), and that of u0(c) where a network gives it: u0 counts like one more column, whose action
+    is always 1. Actuations of actions up to M then have the constant lipschitz (M + 1).
 
     Raises:
         ValueError: if the map has no network or no limit.
@@ -91,7 +91,7 @@ class LipschitzProjection:
 
     @property
     def limits(self) -> list[float]:
-        """What the matrices of the basis's network may have at most, layer by layer."""
+        """The largest norm that each layer's matrix in the basis's network may have."""
         return self.networks[0].limits
 
     def step(self) -> None:
@@ -100,7 +100,7 @@ class LipschitzProjection:
             network.step()
 
     def exact(self) -> None:
-        """Before weights are kept: afterwards ``certificate`` and ``offset_certificate`` are at most the limit."""
+        """Call it before weights are kept: then ``certificate`` and ``offset_certificate`` are at most the limit."""
         for network in self.networks:
             network.exact()
 
@@ -108,14 +108,14 @@ class LipschitzProjection:
 class NetworkProjection:
     """Keeps a network within a Lipschitz constant.
 
-    Each layer may have the constant limit^(1 / layers). The exact spectral norm is too dear for every step: ``step``
-    follows it by power iteration, one round a step from where the last one ended, which can be a little low; ``exact``
-    leaves no doubt. The Frobenius norm, never smaller than the spectral one, is exact in both.
+    Each layer may have the constant limit^(1 / layers). The exact spectral norm is too expensive for every step:
+    ``step`` estimates it by one power iteration, which continues the last one and may be a little low; ``exact``
+    computes it. The Frobenius norm, never smaller than the spectral one, is exact in both.
 
     Args:
         network: whose layers are scaled.
         limit: of the network, from raw contexts to its output.
-        frobenius: whether that norm of the matrices is limited, rather than the spectral one.
+        frobenius: limit the Frobenius norm of the matrices instead of the spectral norm.
     """
 
     def __init__(self, network: ContextNetwork, limit: float, *, frobenius: bool) -> None:
@@ -165,11 +165,11 @@ def _constant(network: ContextNetwork) -> float:
 
 
 def _matrices(network: ContextNetwork) -> list[Tensor]:
-    """The layers' matrices, of the heads one each; the first one as it acts on the raw context."""
+    """The matrix of each layer, or of each head of it; the first acts on the raw context."""
     weights = [network.linear(i).weight for i in range(len(network.layers))]
     return [weights[0] / network.context_std, *weights[1:]]
 
 
 def _slopes(network: ContextNetwork) -> list[float]:
-    """The largest slope of what follows each layer; nothing follows the last."""
+    """The largest slope of the activation after each layer; 1 after the last, which has none."""
     return [ACTIVATION_SLOPES[network.activation]] * (len(network.layers) - 1) + [1.0]

@@ -15,9 +15,9 @@ from nht.episodes import check, items, key_name
 from nht.memmap_files import raw
 from nht.reading import checksum, entry, known_entries, read_json
 
-FORMAT = "nht.demos"
-FORMAT_VERSION = 1
-MANIFEST = "manifest.json"
+DEMOS_FORMAT = "nht.demos"
+DEMOS_FORMAT_VERSION = 1
+DEMOS_MANIFEST = "manifest.json"
 PACKAGES = ("nht", "torch", "torchrl", "tensordict", "numpy", "mujoco")  # whose versions the manifest records
 ENTRIES: dict[str, type | tuple[type, ...]] = {
     "format": str,
@@ -32,7 +32,7 @@ ENTRIES: dict[str, type | tuple[type, ...]] = {
     "versions": dict,
     "fingerprint": str,
 }
-"""Of a manifest; ``checksum``, over all of these, is missing in those of earlier versions."""
+"""Entries of a manifest and their types; earlier versions wrote no ``checksum``, which is over all others."""
 
 
 def manifest_of(
@@ -53,8 +53,8 @@ def manifest_of(
     """
     check(data)
     return {
-        "format": FORMAT,
-        "format_version": FORMAT_VERSION,
+        "format": DEMOS_FORMAT,
+        "format_version": DEMOS_FORMAT_VERSION,
         "env": env,
         "seed": seed,
         "expert": expert,
@@ -65,7 +65,7 @@ def manifest_of(
 
 
 def described(data: TensorDictBase) -> dict[str, Any]:
-    """What a manifest says of the data themselves."""
+    """The entries of a manifest that describe the data."""
     return {
         "episodes": len(torch.unique(data["episode"])),
         "transitions": len(data),
@@ -96,7 +96,7 @@ def _versions() -> dict[str, str]:
 
 
 def manifest_text(manifest: dict[str, Any]) -> str:
-    """What stands in the file of a manifest.
+    """The text of a manifest's file.
 
     Raises:
         TypeError: if its settings hold other values than JSON has.
@@ -113,15 +113,19 @@ def read_manifest(path: Path) -> dict[str, Any]:
         ValueError: on another format version, on entries that are missing, unknown or of other types, and on a manifest
             that was changed.
     """
-    file = path / MANIFEST
+    file = path / DEMOS_MANIFEST
     if not file.is_file():
-        raise FileNotFoundError(f"{path} holds no demonstrations: there is no {MANIFEST} in it.")
+        raise FileNotFoundError(f"{path} holds no demonstrations: there is no {DEMOS_MANIFEST} in it.")
     manifest = read_json(file)
-    if manifest.get("format") != FORMAT:
-        raise ValueError(f"{path} holds no demonstrations: its {MANIFEST} is not marked {FORMAT!r}.")
+    if manifest.get("format") != DEMOS_FORMAT:
+        raise ValueError(
+            f"{path} holds no demonstrations: its {DEMOS_MANIFEST} is not marked {DEMOS_FORMAT!r}."
+        )
     found = entry(manifest, "format_version", int, str(file))
-    if found != FORMAT_VERSION:
-        raise ValueError(f"{path} has format version {found}, this version of nht reads {FORMAT_VERSION}.")
+    if found != DEMOS_FORMAT_VERSION:
+        raise ValueError(
+            f"{path} has format version {found}, this version of nht reads {DEMOS_FORMAT_VERSION}."
+        )
     for name, kind in ENTRIES.items():
         entry(manifest, name, kind, str(file))
     known_entries(manifest, [*ENTRIES, "checksum"], str(file))

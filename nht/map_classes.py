@@ -1,4 +1,4 @@
-"""Which class a map file means: by module and name, so that two classes of one name are never mistaken."""
+"""Finds the class that a map file names, by module and name, so that two classes of one name are not confused."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from nht.alignment import Aligned
 from nht.jacobian import JacobianPinv
 from nht.laser import CAE, LASER
 from nht.maps import NHT, SVD, Identity
+from nht.reading import shortened
 from nht.residual import Residual
 from nht.scl import SCL
 
-OURS: dict[str, type[ActionMap]] = {
+OUR_CLASSES: dict[str, type[ActionMap]] = {
     kind.__name__: kind for kind in (NHT, SVD, Identity, SCL, CAE, LASER, JacobianPinv, Aligned, Residual)
 }
 PACKAGE = "nht"  # the module that files name for all of ours, wherever in the package they are defined
@@ -23,7 +24,7 @@ PACKAGE = "nht"  # the module that files name for all of ours, wherever in the p
 
 def identity(kind: type[ActionMap]) -> tuple[str, str]:
     """Module and qualified name, as they stand in a file."""
-    if OURS.get(kind.__name__) is kind:
+    if OUR_CLASSES.get(kind.__name__) is kind:
         return PACKAGE, kind.__name__
     return kind.__module__, kind.__qualname__
 
@@ -40,9 +41,9 @@ def find_class(module: str, name: str, allow: Sequence[str] = ()) -> type[Action
         ValueError: if its module is neither imported nor allowed, has no such action map, or has two.
     """
     if module == PACKAGE:
-        if name not in OURS:
-            raise ValueError(f"unknown class {name!r}; those of nht are {', '.join(sorted(OURS))}.")
-        return OURS[name]
+        if name not in OUR_CLASSES:
+            raise ValueError(f"unknown class {name!r}; those of nht are {', '.join(sorted(OUR_CLASSES))}.")
+        return OUR_CLASSES[name]
     found = _imported(module, name)
     if not found and module not in sys.modules:
         _import(module, name, allow)
@@ -50,7 +51,7 @@ def find_class(module: str, name: str, allow: Sequence[str] = ()) -> type[Action
     if not found:
         raise ValueError(f"the module {module!r} is imported, but has no action map {name!r}.")
     if len(found) > 1:
-        raise ValueError(f"the module {module!r} has made {len(found)} classes {name!r}: which is meant?")
+        raise ValueError(f"the module {module!r} has made {len(found)} classes {name!r}; it must have one.")
     return found[0]
 
 
@@ -60,11 +61,11 @@ def find_by_name(name: str) -> type[ActionMap]:
     Raises:
         ValueError: if there is none, or more than one.
     """
-    if name in OURS:
-        return OURS[name]
+    if name in OUR_CLASSES:
+        return OUR_CLASSES[name]
     found = [kind for kind in _concrete() if kind.__name__ == name]
     if not found:
-        known = ", ".join(sorted({*OURS, *(kind.__name__ for kind in _concrete())}))
+        known = ", ".join(sorted({*OUR_CLASSES, *(kind.__name__ for kind in _concrete())}))
         raise ValueError(
             f"unknown class {name!r}; known are {known}. Import a class of your own before loading its map."
         )
@@ -77,7 +78,7 @@ def find_by_name(name: str) -> type[ActionMap]:
 
 
 def _imported(module: str, name: str) -> list[type[ActionMap]]:
-    """The classes of this module and name: the one that stands there now, else all that were made there."""
+    """The classes of this module and name: the one that the module holds now, else all that it ever defined."""
     found = [kind for kind in _concrete() if (kind.__module__, kind.__qualname__) == (module, name)]
     current: object = sys.modules.get(module)
     for part in name.split("."):
@@ -96,7 +97,7 @@ def _import(module: str, name: str, allow: Sequence[str]) -> None:
     try:
         importlib.import_module(module)
     except Exception as error:  # a module may raise anything
-        reason = f"{type(error).__name__}: {error}"
+        reason = shortened(f"{type(error).__name__}: {error}")
         raise ValueError(f"its class {name!r} needs the module {module!r}: {reason}.") from error
 
 

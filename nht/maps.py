@@ -49,7 +49,7 @@ class NHT(LinearActionMap):
         offset: "none" for u0 = 0; "constant", trained from the mean of the demonstrations on; "contextual", from a
             network of its own, of the same widths, which keeps to ``lipschitz`` too.
         start: where training starts: "svd", from the plane that SVD finds in the training data, the same for all
-            contexts; or "random". With the former a strict limit leaves SVD's plane, not any plane.
+            contexts; or "random". With "svd", a strict Lipschitz limit ends at SVD's plane, not at an arbitrary one.
         seed: of the initial weights.
 
     Raises:
@@ -124,9 +124,9 @@ class NHT(LinearActionMap):
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:
-        """Set the normaliser and where to start; the rest is left to gradient steps.
+        """Set the normaliser and the weights to start from; gradient steps do the rest.
 
-        A map that has been trained goes on from where it is.
+        A map that was trained before keeps its weights.
         """
         context, actuation = batch["context"], batch["actuation"]
         if self.normalise:
@@ -144,17 +144,16 @@ class NHT(LinearActionMap):
 class SVD(LinearActionMap):
     """One basis for all contexts: the k leading right singular vectors of the demonstrated actuations.
 
-    Without an offset they are not centred before, because a = 0 must stay u = 0. Until trained, the basis is the first
-    k axes.
+    Without an offset the actuations are not centred first, because a = 0 must stay u = 0. Until trained, the basis is
+    the first k axes.
 
     Args:
         actuation_dim: n.
         action_dim: k, in 1 ... n.
         context_dim: width of the context.
         offset: "none" for u0 = 0; "constant" for the mean actuation; "contextual" for u0(c) = A c + b. Least squares
-            for u0, then the singular vectors of what it leaves: no other pair of the two has a smaller error, for
-            whatever the basis is, this u0 leaves least outside its span. An offset that is not linear takes gradient
-            steps: NHT has it.
+            gives u0, the singular vectors of the residuals the basis: no other pair has a smaller error, because this
+            u0 leaves the least outside the span of any basis. NHT has offsets that are not linear.
     """
 
     frame: Tensor
@@ -172,12 +171,12 @@ class SVD(LinearActionMap):
             self.offset_model = LinearOffset(context_dim, actuation_dim)
 
     def basis(self, context: Tensor) -> Tensor:
-        """The same for every context."""
+        """The basis, which is the same for every context."""
         return self.frame.expand(*context.shape[:-1], -1, -1)
 
     @torch.no_grad()
     def basis_norm(self) -> float:
-        """That of the one basis."""
+        """The spectral norm of the basis."""
         return float(torch.linalg.matrix_norm(self.frame.double(), ord=2))
 
     def forward(self, action: Tensor, context: Tensor) -> Tensor:

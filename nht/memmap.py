@@ -1,9 +1,9 @@
-"""TensorDicts read without trust from folders of raw files, as ``TensorDict.memmap`` lays them out.
+"""Reads TensorDicts from untrusted folders of raw files, in the layout of ``TensorDict.memmap``.
 
 A folder has a ``meta.json``, which says type, shape and batch size, one ``key.memmap`` of raw values for each tensor,
-and one folder for each TensorDict inside. TensorDict's own reader believes the ``meta.json``: it unpickles what is
-marked as pickled, and lengthens files that are shorter than they should be. This one compares all sizes with the files
-first, maps privately, so that neither reading nor writing to a tensor can change a file, and unpickles nothing.
+and one folder for each TensorDict inside. TensorDict's own reader trusts the ``meta.json``: it unpickles what is marked
+as pickled, and lengthens files that are shorter than they should be. This one compares all sizes with the files first,
+maps privately, so that neither reading nor writing to a tensor can change a file, and unpickles nothing.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import torch
 from tensordict import LazyStackedTensorDict, NonTensorStack, TensorDict, TensorDictBase
 from torch import Tensor
 
-from nht.memmap_files import DTYPES, META, PLAIN, STORAGE, file_name
+from nht.memmap_files import DTYPES, META, STORAGE, TENSORDICT_TYPE, file_name
 from nht.reading import entry, plain_file, read_json, shortened
 
 STACK = "<class 'tensordict._lazy.LazyStackedTensorDict'>"
 DATA = "<class 'tensordict.tensorclass.NonTensorData'>"
 DATA_STACK = "<class 'tensordict.tensorclass.NonTensorStack'>"
-TRUST = (
+TRUSTED_MEMMAP = (
     "If you trust the folder, load it yourself with tensordict.TensorDict.load_memmap(folder, allow_pickle=True) and "
-    "hand the data over: nht.Demos.from_tensordict(data)."
+    "hand the data over: nht.Demos.from_tensordict(data)"
 )
 
 
@@ -80,16 +80,18 @@ def _read(folder: Path) -> Any:
     kind = entry(record, "_type", str, str(file))
     pickled = [name for name in ("other.pickle", "pickle.pkl") if os.path.lexists(folder / name)]
     if pickled or (kind == DATA_STACK and record.get("data") == "pickle.pkl"):
-        raise ValueError(f"{folder} holds pickled data, which could run any code, and is not read. {TRUST}.")
+        raise ValueError(
+            f"{folder} holds pickled data, which could run any code, and is not read. {TRUSTED_MEMMAP}."
+        )
     if kind == DATA:
         return _Value(record.get("data"))
     if kind == DATA_STACK and "data" in record:
         return NonTensorStack.from_list(entry(record, "data", list, str(file)))
     if kind in (STACK, DATA_STACK):
         return _read_stack(folder, record)
-    if kind != PLAIN:
+    if kind != TENSORDICT_TYPE:
         raise ValueError(
-            f"{file} is of {shortened(kind, 80)}, expected a TensorDict or a stack of them. {TRUST}."
+            f"{file} is of {shortened(kind, 80)}, expected a TensorDict or a stack of them. {TRUSTED_MEMMAP}."
         )
     return _read_plain(folder, record)
 
@@ -143,7 +145,7 @@ def _read_stack(folder: Path, record: dict[str, Any]) -> TensorDictBase:
 def _read_tensor(folder: Path, key: str, about: Mapping[str, Any], where: str) -> Tensor:
     """One raw file, mapped so that it cannot be changed."""
     if about.get("is_nested"):
-        raise ValueError(f"{where} is a nested tensor, which is not read. {TRUST}.")
+        raise ValueError(f"{where} is a nested tensor, which is not read. {TRUSTED_MEMMAP}.")
     name = entry(about, "dtype", str, where)
     if name not in DTYPES:
         raise ValueError(f"{where} is of type {shortened(name, 80)!r}, expected one of {', '.join(DTYPES)}.")

@@ -34,7 +34,7 @@ DTYPES = {
         torch.complex128,
     )
 }
-PLAIN = "<class 'tensordict._td.TensorDict'>"
+TENSORDICT_TYPE = "<class 'tensordict._td.TensorDict'>"
 """The type of a TensorDict in its ``meta.json``."""
 
 
@@ -49,7 +49,7 @@ def file_name(key: str) -> str:
 def write_tensordict(data: TensorDictBase, folder: Path) -> None:
     """Write a TensorDict of tensors into a new folder, as ``TensorDict.memmap`` lays it out.
 
-    Written like any file: on a full disk it says so, where writing into mapped memory kills the process.
+    Files are written, not mapped: on a full disk this raises, where writing into mapped memory kills the process.
 
     Raises:
         OSError: if there is no room.
@@ -72,7 +72,7 @@ def write_tensordict(data: TensorDictBase, folder: Path) -> None:
         }
         if value.numel():
             (folder / f"{file_name(key)}.memmap").write_bytes(raw(value))
-    record |= {"shape": list(data.batch_size), "device": "cpu", "_type": PLAIN}
+    record |= {"shape": list(data.batch_size), "device": "cpu", "_type": TENSORDICT_TYPE}
     (folder / META).write_text(json.dumps(record, separators=(",", ":")))
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from nht.demos import Demos
 from nht.minari_episodes import minari_episodes
-from nht.minari_file import check_dataset, leaves_that_are_no_arrays, local_datasets
-from nht.minari_internals import FOLDER, METADATA, UNREADABLE, datasets_root, import_minari
+from nht.minari_file import check_minari_dataset, leaves_that_are_no_arrays, local_datasets
+from nht.minari_internals import FOLDER, METADATA, MINARI_ERRORS, datasets_root, import_minari
 from nht.reading import naming, shortened, shown
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def from_minari(
 
 
 def left_out_observations(dataset: MinariDataset, context: Any) -> dict[str, list[str]]:
-    """For a manifest's settings: which observations are no arrays, where all were asked for. Empty if all are."""
+    """For a manifest's settings: the observations left out as no arrays, if all were asked for; else empty."""
     names = [] if context is not None else list(leaves_that_are_no_arrays(dataset.observation_space))
     return {"left_out_observations": names} if names else {}
 
@@ -69,14 +69,14 @@ def open_minari(dataset: MinariDataset | str | Path) -> MinariDataset:
         return dataset
     folder = _data_folder(dataset)
     try:
-        check_dataset(folder)
+        check_minari_dataset(folder)
         return minari.MinariDataset(folder)
-    except UNREADABLE as error:
+    except MINARI_ERRORS as error:
         raise ValueError(f"the Minari dataset {dataset} cannot be read: {shortened(error, 600)}.") from error
 
 
 def _data_folder(dataset: str | Path) -> Path:
-    """Where the files of a dataset are, which is named by its id, its folder or the HDF5 file in it."""
+    """The ``data`` folder of a dataset, given by its id, its folder or the HDF5 file in it."""
     path = Path(dataset)
     folder = path.parent if path.is_file() else path
     for found in (folder, folder / FOLDER, datasets_root() / str(dataset) / FOLDER):

@@ -12,19 +12,19 @@ from tensordict import TensorDict
 
 from nht.arrays import as_tensor
 from nht.episodes import whole_episodes
-from nht.minari_internals import UNREADABLE
+from nht.minari_internals import MINARI_ERRORS
 from nht.reading import naming, shortened, shown
 
 if TYPE_CHECKING:
     from minari import EpisodeData, MinariDataset
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
 
 def minari_episodes(
     dataset: MinariDataset, context: Mapping[str, str] | Sequence[str] | None = None
 ) -> tuple[TensorDict, int]:
-    """What ``from_minari`` makes demonstrations of, values unseen: transitions, and how many episodes are left out."""
+    """The transitions of a dataset, their values not checked yet, and the number of episodes that are left out."""
     targets = context if context is None or isinstance(context, Mapping) else {name: name for name in context}
     with naming(dataset.storage.data_path):
         parts, lengths = [], []
@@ -47,7 +47,7 @@ def minari_episodes(
         )
 
 
-def _joined(name: str, parts: list[dict[tuple[str, ...], Array]], lengths: list[int]) -> TensorDict:
+def _joined(name: str, parts: list[dict[tuple[str, ...], AnyArray]], lengths: list[int]) -> TensorDict:
     """The rows of all episodes one after another, with the number of each one's episode."""
     if differing := {key for part in parts for key in part.keys() ^ parts[0].keys()}:
         entries = sorted("/".join(key) for key in differing)
@@ -61,17 +61,17 @@ def _joined(name: str, parts: list[dict[tuple[str, ...], Array]], lengths: list[
 def _episodes(dataset: MinariDataset) -> Iterator[EpisodeData]:
     try:
         yield from dataset.iterate_episodes()
-    except UNREADABLE as error:
+    except MINARI_ERRORS as error:
         raise ValueError(
             f"the Minari dataset {dataset.id} cannot be read, it may be cut short or of another env: "
             f"{shortened(error, 600)}."
         ) from error
 
 
-def moments_of(dataset: MinariDataset, episode: EpisodeData) -> dict[str, Array]:
-    """What was known at each moment of an episode of T steps, (T + 1, *shape) by name. Checks all shapes."""
+def moments_of(dataset: MinariDataset, episode: EpisodeData) -> dict[str, AnyArray]:
+    """Observations and infos at the T + 1 moments of an episode, (T + 1, *shape) by name. Checks all shapes."""
     steps = len(episode)
-    moments: dict[str, Array] = {}
+    moments: dict[str, AnyArray] = {}
     for name, values, space in _leaves(episode.observations, dataset.observation_space, "observation"):
         _check_shape(
             dataset, episode, f"entry {name!r} of the observations", values, (steps + 1, *space.shape)
@@ -92,10 +92,10 @@ def moments_of(dataset: MinariDataset, episode: EpisodeData) -> dict[str, Array]
 
 
 def _transitions(
-    episode: EpisodeData, moments: dict[str, Array], names: set[str]
-) -> dict[tuple[str, ...], Array]:
+    episode: EpisodeData, moments: dict[str, AnyArray], names: set[str]
+) -> dict[tuple[str, ...], AnyArray]:
     """The rows of an episode, (T, *shape) by key, in TorchRL's layout."""
-    rows: dict[tuple[str, ...], Array] = {
+    rows: dict[tuple[str, ...], AnyArray] = {
         ("action",): episode.actions,
         ("next", "reward"): episode.rewards,
         ("next", "terminated"): episode.terminations,
@@ -108,7 +108,7 @@ def _transitions(
     return rows
 
 
-def _leaves(values: Any, space: Any, name: str) -> Iterator[tuple[str, Array, Any]]:
+def _leaves(values: Any, space: Any, name: str) -> Iterator[tuple[str, AnyArray, Any]]:
     """Arrays of an observation with their names and spaces; the entries of a Dict space have their own names."""
     if isinstance(values, dict):
         for key, value in values.items():
@@ -120,7 +120,7 @@ def _leaves(values: Any, space: Any, name: str) -> Iterator[tuple[str, Array, An
         yield name, values, space
 
 
-def _arrays(values: Any, name: str) -> Iterator[tuple[str, Array]]:
+def _arrays(values: Any, name: str) -> Iterator[tuple[str, AnyArray]]:
     if isinstance(values, dict):
         for key, value in values.items():
             yield from _arrays(value, f"{name}/{key}")
@@ -129,7 +129,7 @@ def _arrays(values: Any, name: str) -> Iterator[tuple[str, Array]]:
 
 
 def _check_shape(
-    dataset: MinariDataset, episode: EpisodeData, name: str, values: Array, expected: tuple[int, ...]
+    dataset: MinariDataset, episode: EpisodeData, name: str, values: AnyArray, expected: tuple[int, ...]
 ) -> None:
     if values.shape != expected:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Folders of Minari datasets, looked at before Minari opens them.
+"""Checks the folder of a Minari dataset before Minari opens it.
 
 Minari itself runs code for a dataset that does not say its spaces: it makes the environment that the metadata name, by
 an entry point of the file's choice. It also follows HDF5's links into other files, and opens frames as whatever kind
@@ -26,12 +26,12 @@ from nht.minari_internals import (
 )
 from nht.reading import entry, parse_json, plain_file, read_json, shortened
 
-TRUST = (
+TRUSTED_MINARI = (
     "If you trust the dataset, open it yourself and hand it over: "
-    "nht.from_minari(minari.MinariDataset(folder)) or nht.from_minari(minari.load_dataset(id))."
+    "nht.from_minari(minari.MinariDataset(folder)) or nht.from_minari(minari.load_dataset(id))"
 )
 DEEPEST = 32
-"""Spaces within spaces."""
+"""Largest depth of nested spaces."""
 
 
 def local_datasets() -> list[str]:
@@ -40,7 +40,7 @@ def local_datasets() -> list[str]:
     return sorted(str(file.parent.parent.relative_to(root)) for file in root.glob(f"**/{FOLDER}/{METADATA}"))
 
 
-def check_dataset(folder: Path) -> None:
+def check_minari_dataset(folder: Path) -> None:
     """Check that opening a dataset's ``data`` folder runs nothing, and that all that is read lies in it.
 
     Raises:
@@ -53,7 +53,8 @@ def check_dataset(folder: Path) -> None:
     kind = entry(about, "data_format", str, str(file))
     if kind != "hdf5":
         raise ValueError(
-            f"{file}: 'data_format' is {shortened(kind, 40)!r}, expected 'hdf5', the one that is read. {TRUST}."
+            f"{file}: 'data_format' is {shortened(kind, 40)!r}, expected 'hdf5', the one that is read. "
+            f"{TRUSTED_MINARI}."
         )
     for name in ("total_episodes", "total_steps"):
         if not 0 <= entry(about, name, int, str(file)) < 2**48:
@@ -82,7 +83,7 @@ def _space(about: dict[str, Any], name: str, file: Path) -> dict[str, Any]:
     if name not in about:
         raise ValueError(
             f"{file} has no {name!r}: to find it, Minari would make the environment that 'env_spec' names, which can "
-            f"run any code. {TRUST}."
+            f"run any code. {TRUSTED_MINARI}."
         )
     where = f"{file}: {name!r}"
     space = parse_json(entry(about, name, str, str(file)), where)
@@ -110,7 +111,7 @@ def _check_space(space: Any, where: str, depth: int) -> None:
 
 
 def _check_box(space: dict[str, Any], where: str) -> None:
-    """Bounds in full: Minari would blow a single number up to whatever shape the file says."""
+    """Check that all bounds are given: Minari would expand a single number to whatever shape the file says."""
     shape = entry(space, "shape", list, where)
     if not all(type(size) is int and size >= 0 for size in shape):
         raise ValueError(f"{where}: 'shape' must be a list of sizes, got {shortened(repr(shape), 60)}.")

@@ -1,7 +1,7 @@
 """What this package relies on in Minari beside its public interface; tests fail by name when an upgrade breaks one.
 
-That is where and how datasets lie on disk, for they are looked at before Minari opens them, and moved as a whole after
-it wrote them.
+That is where and how datasets lie on disk: they are checked before Minari opens them, and moved into place after it
+wrote them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
 FOLDER, METADATA, DATA = "data", "metadata.json", "main_data.hdf5"
-"""Of a dataset: the folder in it, and the two files in that."""
+"""The folder in a dataset, and the two files in that folder."""
 
 NAMESPACE = "namespace_metadata.json"
 """What Minari writes about the part before the slash of a dataset's id, in the folder of that name."""
@@ -25,7 +25,7 @@ NAMESPACE = "namespace_metadata.json"
 JPEG = b"\xff\xd8\xff"
 """What every JPEG file begins with; Minari stores frames so, unless the metadata's ``jpeg_encoding`` is false."""
 
-UNREADABLE = (
+MINARI_ERRORS = (
     OSError,
     ValueError,
     LookupError,
@@ -40,7 +40,7 @@ UNREADABLE = (
 
 
 def import_minari() -> ModuleType:
-    """Minari, or how to get it."""
+    """Import Minari; the ImportError says how to install it."""
     try:
         import minari
     except ImportError as error:
@@ -55,7 +55,7 @@ def datasets_root() -> Path:
 
 @contextmanager
 def datasets_in(root: Path) -> Iterator[None]:
-    """Let Minari write below ``root``, which it only takes from the environment of the process."""
+    """Within, Minari reads and writes below ``root``; only an environment variable can tell it so."""
     before = os.environ.get("MINARI_DATASETS_PATH")
     os.environ["MINARI_DATASETS_PATH"] = str(root)
     try:
@@ -67,7 +67,7 @@ def datasets_in(root: Path) -> Iterator[None]:
 
 
 def check_dataset_id(dataset_id: str) -> None:
-    """Raise ValueError on an id that is none.
+    """Raise ValueError for an invalid dataset id.
 
     Relies on ``minari.dataset.minari_dataset.parse_dataset_id``, which fails otherwise where the version is missing.
     """

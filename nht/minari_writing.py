@@ -11,12 +11,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from nht.demos import Demos
-from nht.episodes import FLAGS, items, key_name
+from nht.episodes import EPISODE_FLAGS, items, key_name
 from nht.minari_episodes import moments_of
 from nht.minari_internals import (
     FOLDER,
+    MINARI_ERRORS,
     NAMESPACE,
-    UNREADABLE,
     check_dataset_id,
     datasets_in,
     datasets_root,
@@ -81,7 +81,7 @@ def to_minari(
                 dataset = minari.create_dataset_from_buffers(dataset_id, buffers, env=env, **about, **spaces)
             for episode in dataset.iterate_episodes():
                 moments_of(dataset, episode)
-        except UNREADABLE as error:
+        except MINARI_ERRORS as error:
             raise ValueError(
                 f"the demonstrations cannot be written as a dataset of env {env}: {shortened(error, 600)}."
             ) from error
@@ -125,7 +125,7 @@ def _buffer(steps: TensorDictBase, moments: TensorDictBase, observed: list[str])
 
 def _now_and_next(data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
     """The context keys of all transitions, before and after the step."""
-    following = data.get("next", TensorDict(batch_size=data.batch_size)).exclude("reward", *FLAGS)
+    following = data.get("next", TensorDict(batch_size=data.batch_size)).exclude("reward", *EPISODE_FLAGS)
     missing = [name for name in ("reward", "terminated", "truncated") if name not in data]
     if missing or following.is_empty():
         lacking = [*missing, *(["observations under 'next'"] if following.is_empty() else [])]

@@ -1,4 +1,4 @@
-"""What turns a context into the description of an action map: a multilayer perceptron, with one head or several."""
+"""The network from a context to the parameters of an action map: a multilayer perceptron with one or several heads."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class ContextNetwork(nn.Module):
 
     @torch.no_grad()
     def start_from(self, output: Tensor) -> None:
-        """Give all contexts this very output, (output_dim,), until gradient steps tell them apart."""
+        """Give all contexts the same output, (output_dim,), to start training from."""
         head = self.linear(-1)
         head.weight.zero_()
         head.bias.copy_(output.view_as(head.bias))

@@ -1,4 +1,4 @@
-"""Where an affine map rests: u0(c), the actuation of no action, of robots that do not rest at zero."""
+"""The offset u0(c) of an affine map: the actuation at action 0, for robots that do not rest at zero."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class NetworkOffset(nn.Module):
         return cast(Tensor, self.network(context))
 
     def fit(self, context: Tensor, actuation: Tensor, *, normalise: bool = False) -> None:
-        """Let u0 be the mean of actuations (T, n) in every context; take the normaliser from contexts, if asked."""
+        """Set u0 to the mean of actuations (T, n) in every context, and, if asked, the normaliser from contexts."""
         if normalise:
             self.network.normalise(context)
         self.network.start_from(actuation.mean(0))
@@ -85,7 +85,7 @@ class LinearOffset(nn.Module):
 
     @torch.no_grad()
     def fit(self, context: Tensor, actuation: Tensor, *, normalise: bool = False) -> None:
-        """Least squares: contexts (T, context_dim), actuations (T, n)."""
+        """Fit A and b by least squares to contexts (T, context_dim) and actuations (T, n)."""
         context, actuation = context.double(), actuation.double()
         centre, mean = context.mean(0), actuation.mean(0)
         slope = (

@@ -1,4 +1,4 @@
-"""Files that others may have written: plain files of bounded size, whose contents are looked at before they are used.
+"""Reads files that others may have written: plain files of bounded size, whose contents are checked before use.
 
 Nothing here follows a link, opens a pipe or runs what it reads. Every error names the file, what is wrong with it and
 what was expected.
@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import Any
 
 MAX_TEXT = 64 * 2**20
-"""Bytes of the largest text file that is read, a manifest or a table."""
+"""Size of the largest text file that is read [bytes]."""
 
 MAX_SHOWN = 12
 """Names that a message lists before it says how many more there are."""
 
 
 def plain_file(file: Path) -> Path:
-    """The file itself, once it is known to be one: no link, pipe, device or folder.
+    """Check that a file is a plain one, no link, pipe, device or folder, and return it.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -90,14 +90,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 @contextmanager
 def naming(file: object) -> Iterator[None]:
-    """Within, errors about what a file holds name it; what torch says of odd shapes becomes a ValueError."""
+    """Within, errors about the contents of a file name it, and torch's errors about shapes become ValueErrors."""
     try:
         yield
     except (ValueError, KeyError) as error:
         text = str(error.args[0]) if error.args else ""
         if type(error) not in (ValueError, KeyError) or str(file) in text:
             raise
-        raise type(error)(f"{file}: {text}") from error
+        raise type(error)(f"{file}: {text.removesuffix('.')}.") from error
     except (RuntimeError, IndexError, TypeError) as error:
         raise ValueError(f"{file} holds arrays that do not go together: {shortened(error)}.") from error
 
@@ -108,7 +108,7 @@ def entry(record: Mapping[str, Any], name: str, kind: type | tuple[type, ...], w
     Args:
         record: the object.
         name: of the value.
-        kind: type or types that are allowed; a bool counts as an integer nowhere.
+        kind: type or types that are allowed; a bool never counts as an integer.
         where: the file, for messages.
 
     Raises:

@@ -14,7 +14,7 @@ from nht.maps import ActionMap
 class Residual(ActionMap):
     """Another map's action plus n corrections: u = map(a) + scale r, for an action (a, r) of k + n entries.
 
-    So no actuation is out of reach, yet those that the map gives are the easiest to find. A correction of 1 adds
+    So every actuation can be reached, and those that the map gives are the easiest to find. A correction of 1 adds
     ``scale`` to its motor, in units of actuation; ActionMapTransform multiplies it by ``action_scale``, as all of the
     action.
 
@@ -50,20 +50,20 @@ class Residual(ActionMap):
         return self.map(interface, context) + self.scale * correction
 
     def project(self, actuation: Tensor, context: Tensor) -> Tensor:
-        """As much as the map can do, and corrections for the rest: they are as small as the map allows.
+        """The map's own projection, and corrections for what it leaves.
 
-        Mapped back, it gives the very actuation.
+        Mapped back, they give exactly the actuation.
         """
         interface = self.map.project(actuation, context)
         missed = actuation - self.map(interface, context)
         return torch.cat([interface, missed / self.scale], dim=-1)
 
     def rest(self, context: Tensor) -> Tensor:
-        """That of the map inside."""
+        """The rest of the wrapped map."""
         return self.map.rest(context)
 
     def fit(self, batch: TensorDictBase) -> bool:
-        """Refuse, for with corrections every actuation is reached, whatever the map.
+        """Always raise: with corrections every map reaches every actuation, so there is nothing to train.
 
         Raises:
             ValueError: always.

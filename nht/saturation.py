@@ -1,8 +1,8 @@
-"""What becomes of an actuation beyond the limits of the motors, as pure functions of tensors.
+"""Brings actuations within the limits of the motors, as pure functions of tensors.
 
-``clip`` cuts motor by motor: every motor does as much as it can of what was asked, and the actuation turns out of what
-the map spans. ``scale`` shortens the whole actuation, measured from the map's rest, until it fits: it keeps its
-direction, so it stays within what the map spans around its rest.
+``clip`` limits each motor on its own: every motor does as much as it can of what was asked, and the actuation leaves
+the map's span. ``scale`` shortens the whole actuation, measured from the map's rest, until it fits: it keeps its
+direction, so it stays in the map's span around its rest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 Saturation = Literal["scale", "clip"]
 
 DEFAULT_SATURATION: Saturation = "scale"
-"""What a new map does, unless its span is everything, k = n: then nothing can leave it, and each motor is clipped.
+"""The saturation of a new map with k < n. With k = n nothing can leave the span, and ``clip`` is the default.
 
 Measured (``benchmarks/learning/saturation.py``), three seeds each, one map for both kinds, success at the end: DDPG
 through NHT on WAMWipe at an action scale of 4, 1.00, 1.00, 1.00 with ``scale`` and 0.90, 0.62, 0.72 with ``clip``; on
@@ -33,17 +33,17 @@ def saturate(
     kind: Saturation,
     rest: Tensor | None = None,
 ) -> Tensor:
-    """The actuation within ``[low, high]``, in the precision of these; as it is, where there are none.
+    """The actuation brought within ``[low, high]``, in the precision of the limits; unchanged without limits.
 
     Args:
         actuation: (*batch, n).
         low: smallest actuations, (n,) or anything that broadcasts; -infinity where there is no limit.
         high: largest ones, likewise.
         kind: ``"scale"`` or ``"clip"``.
-        rest: the actuation of no action, from which ``scale`` measures, (*batch, n). None for zero.
+        rest: the actuation from which ``scale`` measures, (*batch, n). None for zero.
 
     Returns:
-        (*batch, n). A row with a NaN keeps it, so that whoever executes it can see that something diverged.
+        (*batch, n). A row with a NaN keeps it, so that divergence is noticed where the actuation is executed.
 
     Raises:
         ValueError: on another ``kind``.
@@ -64,9 +64,9 @@ def scale_into(
 ) -> Tensor:
     """``rest + t (actuation - rest)`` with, per row, the largest t in [0, 1] that stays within the limits.
 
-    Where the rest is beyond a limit itself, no t would do: this limit then shortens nothing, and what is left beyond
-    it is cut off. Where the rest lies on a limit, nothing moves that would pass it. An infinite actuation counts as
-    the largest finite one.
+    A limit that the rest itself exceeds does not shorten the actuation; what remains beyond it is clipped. Where the
+    rest lies on a limit, an actuation beyond that limit is shortened to the rest. An infinite actuation counts as the
+    largest finite one.
 
     Args:
         actuation: (*batch, n).

@@ -14,11 +14,11 @@ from nht.offset import ConstantOffset, NetworkOffset, OffsetKind, trained_offset
 
 
 class SCL(LinearActionMap):
-    """State-conditioned linear map: the entries of the basis straight from a network (A.4).
+    """State-conditioned linear map: a network gives the entries of the basis (A.4).
 
-    An action is projected by the pseudo-inverse, damped at the level of rounding. Nothing limits the norm of the
-    basis, and the loss (Eq. 6) does not depend on it: it may grow in training, and with it the actuation that an
-    action of 1 stands for. ``lipschitz`` limits how fast the basis changes, not how long its columns are.
+    Actuations are projected by the pseudo-inverse, damped at the level of rounding. Nothing limits the norm of the
+    basis, and the loss (Eq. 6) does not depend on it: it may grow in training, and with it the actuation that an action
+    of 1 stands for. ``lipschitz`` limits how fast the basis changes, not how long its columns are.
 
     The network's output is the basis, entry by entry. Its Euclidean norm is the Frobenius norm of the basis, which is
     no smaller than the spectral one: from output to basis the Lipschitz constant is 1.
@@ -32,7 +32,7 @@ class SCL(LinearActionMap):
         normalise: scale the entries of the context by their mean and deviation in the training data.
         lipschitz: Lipschitz constant of Q(c) that training keeps to, in the spectral norm and the raw
             context.
-        lipschitz_norm: the norm of the layers' matrices that is limited to this end, "spectral" or "frobenius".
+        lipschitz_norm: which norm of the layers' matrices is limited for it, "spectral" or "frobenius".
         offset: "none" for u0 = 0; "constant", trained from the mean of the demonstrations on; "contextual", from a
             network of its own, of the same widths, which keeps to ``lipschitz`` too. Then u = u0(c) + Q(c) a.
         seed: of the initial weights.

@@ -1,4 +1,4 @@
-"""Whether a map can be saved: what a file holds of it must give the same map again."""
+"""Checks whether a map can be saved: its file must give the same map again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nht.reading import shortened
 
 @torch.no_grad()
 def check_storable(map: ActionMap) -> ActionMap:
-    """Build the twin that a file of this map would give, so that what cannot be saved shows before it is trained.
+    """Build the twin that a file of this map would give, to find out before training whether the map can be saved.
 
     Returns:
         The twin: constructed alike, not trained.
@@ -59,7 +59,7 @@ def _listed(map: ActionMap) -> str:
 
 
 def state_of(map: ActionMap) -> dict[str, Tensor]:
-    """The state as it is written: on the CPU, tied weights each on their own."""
+    """The state as it is saved: on the CPU, with separate copies of tied weights."""
     state = map.state_dict()
     if strange := [key for key, value in state.items() if not isinstance(value, Tensor)]:
         raise TypeError(

@@ -1,4 +1,4 @@
-"""A map in one safetensors file: the weights and, as JSON in the header, what it takes to rebuild the map.
+"""A map in one safetensors file: the weights and, as JSON in the header, what is needed to rebuild the map.
 
 Loading checks every part, never unpickles, and imports nothing that the caller has not allowed. The header can be read
 without this package: ``json.loads(safetensors.safe_open(path, "pt").metadata()["map"])``.
@@ -12,7 +12,6 @@ import math
 import stat
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 import torch
@@ -23,13 +22,14 @@ from torch import Tensor
 from nht.action_map import ActionMap
 from nht.allowance import Allowance
 from nht.description import describe, of_version_1, twin
+from nht.reading import shortened
 from nht.storable import check_storable, state_of
 from nht.writing import replacing
 
 __all__ = ["format_version", "load_map", "save_map"]
 
-FORMAT = "nht.action_map"
-FORMAT_VERSION = 2
+MAP_FORMAT = "nht.action_map"
+MAP_FORMAT_VERSION = 2
 LONGEST_REASON = 600  # characters of what an error says about a file
 
 
@@ -51,7 +51,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
     tensors = state_of(map)
     _check_finite(tensors, check_storable(map).state_dict())
     text = json.dumps(describe(map))
-    header = {"format": FORMAT, "format_version": str(FORMAT_VERSION), "map": text}
+    header = {"format": MAP_FORMAT, "format_version": str(MAP_FORMAT_VERSION), "map": text}
     header["checksum"] = _checksum(text, tensors)
     content = save(tensors, header)
     with replacing(path) as scratch:
@@ -62,8 +62,8 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
 def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Sequence[str] = ()) -> ActionMap:
     """Read a map, ready to use: in eval mode, its parameters without gradients.
 
-    A class of your own is found if its module is imported, or is, or lies in, one of those in ``allow``, which are then
-    imported. Files of format version 1 load as they did; they clip actuations.
+    A class of your own is found if its module has been imported, or if ``allow`` names the module or a package that
+    holds it; then it is imported. Maps in files of format version 1 clip actuations.
 
     Args:
         path: of a file that ``save_map`` wrote.
@@ -83,7 +83,7 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
     except Exception as error:  # whatever stands in a file, the answer names the file
         known = isinstance(error, ValueError) and not isinstance(error, UnicodeError | json.JSONDecodeError)
         reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
-        raise ValueError(f"{path} {shorten(reason, LONGEST_REASON)}.") from error
+        raise ValueError(f"{path} {shortened(reason, LONGEST_REASON)}.") from error
     return map.to(device).eval().requires_grad_(False)
 
 
@@ -111,11 +111,11 @@ def _check_readable(path: Path) -> None:
 
 def _loaded(path: Path, allow: Sequence[str]) -> ActionMap:
     header, tensors = _read(path)
-    if header.get("format") != FORMAT:
-        raise ValueError(f"holds no action map: its header is not marked {FORMAT!r}.")
+    if header.get("format") != MAP_FORMAT:
+        raise ValueError(f"holds no action map: its header is not marked {MAP_FORMAT!r}.")
     found = header.get("format_version")
-    if found not in ("1", str(FORMAT_VERSION)):
-        raise ValueError(f"has format version {found}, this version of nht reads 1 and {FORMAT_VERSION}.")
+    if found not in ("1", str(MAP_FORMAT_VERSION)):
+        raise ValueError(f"has format version {found}, this version of nht reads 1 and {MAP_FORMAT_VERSION}.")
     if found == "1" and "checksum" in header:
         raise ValueError("was changed: it says format version 1, which has no checksum, and has one.")
     text = header["map"]
@@ -137,7 +137,7 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise ValueError(f"is no safetensors file, or is cut short: {error}.") from error
+        raise ValueError(f"is no safetensors file, or is cut short: {shortened(error)}.") from error
 
 
 def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
@@ -167,7 +167,7 @@ def _fill(map: ActionMap, tensors: dict[str, Tensor]) -> None:
 
 
 def _check_description(map: ActionMap, description: dict[str, Any]) -> None:
-    """What the header says for people must be what the map does."""
+    """Check that the header's entries for people agree with the map."""
     for name in ("context_dim", "actuation_dim", "action_dim", "action_scale"):
         if description[name] != (actual := float(getattr(map, name))):
             raise ValueError(
@@ -176,7 +176,7 @@ def _check_description(map: ActionMap, description: dict[str, Any]) -> None:
 
 
 def _check_finite(tensors: dict[str, Tensor], untrained: dict[str, Any]) -> None:
-    """No NaN; infinities, as of bounds, only where the untrained map has some, too."""
+    """Refuse NaN anywhere, and infinities where the untrained map has none."""
     scale = tensors.get("action_scale")
     if scale is None or scale.ndim or not 0 < float(scale) < math.inf:
         raise ValueError(f"holds a map whose action_scale is {scale}; it must be a positive, finite number.")
@@ -197,4 +197,4 @@ def format_version(path: str | Path) -> int:
     try:
         return int(_read(Path(path))[0].get("format_version", "0"))
     except ValueError as error:
-        raise ValueError(f"{path} {error}") from error
+        raise ValueError(f"{path} {shortened(error)}.") from error

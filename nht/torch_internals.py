@@ -1,4 +1,4 @@
-"""The private parts of PyTorch that this package needs, all of them; tests hold each to what is said here."""
+"""All private parts of PyTorch that this package needs; tests check each against its description."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Actions, actuations and contexts of a wrong width are refused, whatever class of map takes them.
+"""Refuses actions, actuations and contexts of a wrong width, whatever the class of the map.
 
-Without this some maps would pad or crop them in silence.
+Without this some maps would silently pad or crop them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 def checked_forward(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A map's ``forward`` that looks at the last dimensions of action and context before."""
+    """A map's ``forward`` that first checks the last dimensions of action and context."""
 
     @functools.wraps(method)
     def forward(self: Any, action: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:
@@ -25,7 +25,7 @@ def checked_forward(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 def checked_project(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A map's ``project`` that looks at the last dimensions of actuation and context before."""
+    """A map's ``project`` that first checks the last dimensions of actuation and context."""
 
     @functools.wraps(method)
     def project(self: Any, actuation: Tensor, context: Tensor, *args: Any, **kwargs: Any) -> Tensor:

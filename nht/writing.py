@@ -1,4 +1,4 @@
-"""Writing files and folders that appear whole or not at all, and stay after a power cut.
+"""Writing files and folders that appear whole or not at all, and survive a power cut.
 
 Each is written beside its place under a hidden name that says which process writes it, brought to disk, and renamed.
 What a killed process left behind is known by that name, and removed by the next one that writes there.
@@ -20,10 +20,10 @@ from pathlib import Path
 
 OWNED = re.compile(r"^\.(?P<name>.+)\.(?P<host>[^.]+)-(?P<pid>\d+)-(?P<born>\d+)-[0-9a-f]{8}$")
 OLD = re.compile(r"^\.(?P<name>.+)\.[0-9a-f]{32}$")
-"""What earlier versions wrote, without an owner."""
+"""Names of scratch files from earlier versions, which do not say who writes them."""
 
 FORGOTTEN = 24 * 3600.0
-"""Seconds after which nobody writes any more to what has no owner that can be asked."""
+"""Seconds without a change after which a scratch file of unknown owner is taken for left over."""
 
 
 @contextmanager
@@ -81,15 +81,14 @@ def check_room(folder: Path, size: float, what: str) -> None:
         folder = folder.parent
     free = shutil.disk_usage(folder).free
     if free < 1.05 * size + 2**20:
-        text = f"{what} takes {size / 1e6:.1f} MB, only {free / 1e6:.1f} MB are left in {folder}"
+        text = f"{what} takes {size / 1e6:.1f} MB, only {free / 1e6:.1f} MB are left in {folder}."
         raise OSError(errno.ENOSPC, text)
 
 
 def remove_leftovers(folder: Path, name: str | None = None) -> list[Path]:
-    """Remove what dead processes left in a folder, for ``name`` or for all names; what was removed.
+    """Remove what dead processes left in a folder, for ``name`` or for all names; returns what was removed.
 
-    A process is dead for sure if it was of this machine and is not there any more. Of another machine's nothing is
-    known, and theirs stays.
+    Only a process of this machine can be known to be dead; what processes of other machines left stays.
     """
     dead = []
     for place in folder.glob(".*"):
@@ -104,7 +103,7 @@ def remove_leftovers(folder: Path, name: str | None = None) -> list[Path]:
 
 
 def _mode_of_new_files(folder: Path) -> int:
-    """Asked of a file that is just made, for reading the umask means setting it, for other threads too."""
+    """The mode of a file that is made for this: reading the umask means setting it, for other threads too."""
     probe = folder / f"{uuid.uuid4().hex}.mode"
     probe.touch()
     return stat.S_IMODE(probe.stat().st_mode)
@@ -115,7 +114,7 @@ def _is_dead(owner: re.Match[str]) -> bool:
 
 
 def _host() -> str:
-    """This machine, and in it the container: another one numbers its processes anew."""
+    """The name of this machine and container; process numbers are unique only within one container."""
     try:
         container = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -124,7 +123,7 @@ def _host() -> str:
 
 
 def _born(pid: int) -> int:
-    """When a process began, in ticks since the machine did; numbers of processes are used again. 0 if there is none."""
+    """When a process began, in clock ticks since boot, as its number may be used again; 0 if there is none."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
     except OSError:

@@ -1,4 +1,4 @@
-"""Entry points: demonstrations, maps, reinforcement learning, evaluation. Where ``nht`` and ``nht.envs`` meet."""
+"""Entry points for demonstrations, maps, reinforcement learning, evaluation; they join ``nht`` and ``nht.envs``."""
 
 from __future__ import annotations
 

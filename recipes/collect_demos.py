@@ -22,7 +22,7 @@ from nht.reading import naming
 from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import CollectDemos
 from nht.recipes.data.files import FILES, best_episodes, read_episodes
-from nht.recipes.data.recording import COPIES, endings, has_success, record, record_expert
+from nht.recipes.data.recording import COPIES, endings, has_success, record_episodes, record_expert
 from nht.recipes.launch import launch
 from nht.recipes.maps.kinds import known_task, task_context_keys
 from nht.recipes.run.environments import mapped_env
@@ -31,7 +31,7 @@ from nht.recipes.sections import DemosConfig, EnvConfig, SourceConfig
 
 
 def main(config: CollectDemos) -> None:
-    """Collect, save and say what came out."""
+    """Collect and save demonstrations, and print a summary."""
     if Path(config.out).exists():
         raise FileExistsError(
             f"{config.out} exists: demonstrations are never overwritten. Choose another folder."
@@ -63,10 +63,10 @@ def record_policy(
     path: str | Path,
     allow: Sequence[str] = (),
 ) -> nht.Demos:
-    """Demonstrations of a finished run's policy, without exploration: what the motors got, through the run's map.
+    """Record demonstrations of a finished run's policy, without exploration: the actuations that its map gives.
 
-    The task's options are those of the run, but its episodes end at success and failure. Of tasks that know success,
-    successful episodes are kept; of all, those with a return of at least ``demos.min_return``.
+    The task's options are those of the run, but its episodes end at success and failure. Kept are successful episodes,
+    if the task has a notion of success, and only those with a return of at least ``demos.min_return``, if that is set.
 
     Raises:
         FileNotFoundError: if ``run`` holds no finished run.
@@ -83,7 +83,7 @@ def record_policy(
     simulation = mapped_env(task_config, kept_map(folder, trained, allow=allow), seed=seed, num_envs=COPIES)
     policy = load_policy(folder, simulation, trained)
     with closing(simulation), set_exploration_type(ExplorationType.DETERMINISTIC):
-        data, left_out = record(
+        data, left_out = record_episodes(
             simulation,
             simulation.base_env.task,
             policy,
@@ -104,7 +104,7 @@ def record_policy(
 def import_demos(
     source: SourceConfig, env: EnvConfig, min_return: float | None, path: str | Path
 ) -> nht.Demos:
-    """Save the whole episodes of others' file as demonstrations of ``env``, those with ``min_return`` if it is given.
+    """Save the whole episodes of a foreign file as demonstrations of ``env``; with ``min_return``, those that reach it.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -149,7 +149,7 @@ def check_fits(demos: nht.Demos, env: EnvConfig, name: str) -> None:
 
 
 def _bare(env: str) -> str:
-    """A task's name without namespace, version and spelling: ``HalfCheetah-v5`` is ``half_cheetah``."""
+    """A task's name without namespace and version, in snake case: ``HalfCheetah-v5`` is ``half_cheetah``."""
     return re.sub(r"[^a-z0-9]", "", re.sub(r"-v\d+$", "", env.rsplit("/", 1)[-1]).lower())
 
 

@@ -21,8 +21,15 @@ import nht
 from nht.recipes.config import CompareMaps
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
-from nht.recipes.maps.interface import train_map
-from nht.recipes.maps.kinds import arm_of, file_name, find_kind, make_map, map_context_keys, tasks_with_arm
+from nht.recipes.maps.interface import trained_map
+from nht.recipes.maps.kinds import (
+    arm_of,
+    find_kind,
+    kind_in_file_name,
+    make_map,
+    map_context_keys,
+    tasks_with_arm,
+)
 
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
@@ -63,10 +70,10 @@ def main(config: CompareMaps) -> None:
     rows, maps, table = [], {}, pandas.DataFrame()
     out.mkdir(parents=True)
     for settings in chosen:
-        trained = train_map(settings, config.env, config.demos, config.seed)
+        trained = trained_map(settings, config.env, config.demos, config.seed)
         kind, k = settings.kind, trained.map.action_dim
         maps[kind, k] = trained.map
-        nht.save_map(trained.map, out / "maps" / f"{file_name(kind)}-k{k}.safetensors")
+        nht.save_map(trained.map, out / "maps" / f"{kind_in_file_name(kind)}-k{k}.safetensors")
         rows.append({"map": kind, "k": k, **_measured(trained, demos)})
         table = pandas.DataFrame(rows)
         table.to_csv(out / "table.csv", index=False)
@@ -95,8 +102,9 @@ def _measured(trained: nht.MapTraining, demos: nht.Demos) -> dict[str, float]:
 def largest_ratio(map: nht.ActionMap, context: torch.Tensor) -> float:
     """How fast the interface changes with the context, at most, between neighbours in time.
 
-    Of a linear map the largest |Q(c) - Q(c')| / |c - c'|, in the spectral norm. Of any other, which has no basis, the
-    largest |u(a, c) - u(a, c')| / (|a| |c - c'|) for the fixed actions a of plus and minus ``action_scale`` on an axis.
+    For a linear map, the largest |Q(c) - Q(c')| / |c - c'|, in the spectral norm. For any other, which has no basis,
+    the largest |u(a, c) - u(a, c')| / (|a| |c - c'|) for the fixed actions a of plus and minus ``action_scale`` on an
+    axis.
 
     Args:
         map: any map.
@@ -120,7 +128,7 @@ def largest_ratio(map: nht.ActionMap, context: torch.Tensor) -> float:
 
 @torch.no_grad()
 def latency(map: nht.ActionMap, batch: int) -> float:
-    """Least time of one batch of actuations [s]: what other programs on the same cores disturb least."""
+    """Shortest time of one batch of actuations [s]: the measure that other programs on the same cores disturb least."""
     action, context = torch.ones(batch, map.action_dim), torch.zeros(batch, map.context_dim)
     times: list[float] = []
     start = time.perf_counter()
@@ -134,7 +142,7 @@ def latency(map: nht.ActionMap, batch: int) -> float:
 def _draw(
     config: CompareMaps, maps: dict[tuple[str, int], nht.ActionMap], demos: nht.Demos, out: Path
 ) -> None:
-    """The figures of the maps with ``map.action_dim`` axes, or else the first of ``action_dims``."""
+    """Draw the maps with ``map.action_dim`` axes, or else with the first of ``action_dims``."""
     dims = config.action_dims
     axes = config.map.action_dim if config.map.action_dim in dims else dims[0]
     chosen = {kind: map for (kind, k), map in maps.items() if k == axes or find_kind(kind).fixed_width}
@@ -163,7 +171,7 @@ def _cell(value: str | float) -> str:
 
 
 def _plot(table: pandas.DataFrame, path: Path) -> None:
-    """Error against k. Maps without any error have no place on a logarithmic axis; the legend names them."""
+    """Plot the error against k. The legend names maps with error 0, which a logarithmic axis cannot show."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for kind, rows in table.groupby("map", sort=False):
         error = rows["validation_error"].where(rows["validation_error"] > 0)

@@ -1,6 +1,6 @@
-"""What each recipe can be told: one dataclass per command, checked before anything runs.
+"""The settings of each recipe: one dataclass per command, checked before anything runs.
 
-Those of the algorithms stand in their own rooms, ``nht.recipes.agents``.
+Those of the algorithms are in ``nht.recipes.agents``.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class CompareMaps:
 
 @dataclass
 class SearchConfig:
-    """What is searched: interfaces x configurations x seeds, each a run of a recipe."""
+    """Settings of a search: interfaces x configurations x seeds, each a run of a recipe."""
 
     recipe: str = "ddpg"  # that every run is of: ddpg, td3, sac, ppo or another algorithm
     env: str = "wam_wipe"  # choice of the task
@@ -124,7 +124,7 @@ class SearchConfig:
     space: dict[str, Any] = field(default_factory=dict)  # see recipes/study/space.py
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a search of nothing, or by what runs do not report."""
+        """Raise ValueError for a search without runs, or by a metric that runs do not report."""
         for name in ("configs", "seeds", "total_frames", "best_frames", "learners"):
             if getattr(self, name) < 1:
                 raise ValueError(f"search.{name} must be at least 1, got {getattr(self, name)}.")
@@ -159,7 +159,7 @@ class Report:
     lines: str = "interface"  # or algorithm: what is compared in a table and a figure
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a metric that evaluations do not have, or for lines of another kind."""
+        """Raise ValueError for a metric that evaluations do not have, or an unknown choice of lines."""
         check_outcome("metric", self.metric)
         if self.lines not in ("interface", "algorithm"):
             raise ValueError(f"lines must be interface or algorithm, got {self.lines!r}.")

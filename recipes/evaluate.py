@@ -20,7 +20,7 @@ from nht.recipes.run.video import record_video
 
 
 def main(config: Evaluate) -> None:
-    """Test, film, and say how it went."""
+    """Test a policy, film it, and print the result."""
     folder = Path(config.run)
     trained = read_config(folder, config.allow)
     env = lasting_failures(trained.env)

@@ -1,4 +1,4 @@
-"""A saved map for the robot, as a program that needs no nht.
+"""Export a saved map for a robot, as a program that does not need nht.
 
 python -m nht.recipes.export_map file=runs/nht.safetensors out=runs/nht.onnx
 """
@@ -13,7 +13,7 @@ from nht.recipes.launch import launch
 
 
 def main(config: ExportMap) -> None:
-    """Export, and say what to feed it."""
+    """Export a map, and print which inputs the program takes."""
     map = nht.load_map(config.file, allow=config.allow)
     low, high = (None if limits is None else torch.tensor(limits) for limits in (config.low, config.high))
     out = nht.export_map(

@@ -1,4 +1,4 @@
-"""What ``--help`` of a recipe says: its choices, its settings, their values, and what each of them means."""
+"""The text of a recipe's ``--help``: its choices, and its settings with their values and meanings."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ INDENT = 13
 def help_text(
     about: str, recipe: str, schema: type[Any], values: Mapping[str, Any], groups: Mapping[str, Sequence[str]]
 ) -> str:
-    """All that can be said to a recipe.
+    """The help text of a recipe.
 
     Args:
         about: what the recipe does.
         recipe: its name.
         schema: the dataclass of its settings.
-        values: that they have, by name, those of sections nested.
+        values: of the settings, by name; those of sections are nested.
         groups: the choices of each group.
     """
     lines = [about.strip(), "", f"python -m nht.recipes.{recipe} [choice or setting=value ...]"]
@@ -61,10 +61,10 @@ def _rules(recipe: str) -> list[str]:
 
 
 def _settings(prefix: str, schema: type[Any], values: Mapping[str, Any]) -> Iterator[str]:
-    """A line per setting: name, value, meaning."""
+    """One line per setting: name, value, meaning."""
     found = meanings(schema)
     for name, value in values.items():
-        setting = f"  {prefix}{name}={shown(value)}"
+        setting = f"  {prefix}{name}={as_typed(value)}"
         meaning = found.get(name, "")
         if len(setting) > 44 and meaning:
             yield setting
@@ -72,7 +72,7 @@ def _settings(prefix: str, schema: type[Any], values: Mapping[str, Any]) -> Iter
         yield f"{setting:<44}  # {meaning}" if meaning else setting
 
 
-def shown(value: Any) -> str:
+def as_typed(value: Any) -> str:
     """A value as the command line takes it, on one line."""
     if isinstance(value, str):
         return value
@@ -81,9 +81,9 @@ def shown(value: Any) -> str:
 
 
 def meanings(schema: type[Any]) -> dict[str, str]:
-    """What the fields of a dataclass mean, by name: the comments behind or above them in its source.
+    """The meaning of each field of a dataclass, by name: the comment behind or above it in the source.
 
-    A field that says nothing means what it means in the class that this one is derived from.
+    A field without a comment has the meaning of the base class.
     """
     found: dict[str, str] = {}
     for kind in reversed(schema.__mro__):

@@ -13,9 +13,9 @@ def choices(group: str) -> list[str]:
 
 
 def reason(error: HydraException | OmegaConfBaseException) -> str:
-    """Why Hydra refused, in a line: the first line of its message, and of the cause's.
+    """Why Hydra refused, in one line: the first line of its message, and that of the cause.
 
-    What cannot be read, ``OverrideParseException.override``, is named instead of the grammar's rules.
+    A word that cannot be parsed, ``OverrideParseException.override``, is named instead of the grammar's rules.
     """
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} cannot be read"
@@ -24,11 +24,11 @@ def reason(error: HydraException | OmegaConfBaseException) -> str:
 
 
 def unknown_key(error: HydraException | OmegaConfBaseException) -> str | None:
-    """The dotted name at which Hydra found nothing: OmegaConf's ``full_key``."""
+    """The dotted name that Hydra did not find: OmegaConf's ``full_key``."""
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     return getattr(cause, "full_key", None) or None
 
 
 def listed_choices(error: HydraException | OmegaConfBaseException) -> str:
-    """The choices of a group that Hydra lists after the first line, where that was the mistake."""
+    """The choices of a group, which Hydra lists after the first line if a choice was unknown."""
     return " ".join(["", *str(error).splitlines()[1:]])

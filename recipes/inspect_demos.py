@@ -1,4 +1,4 @@
-"""What demonstrations look like: a summary on the screen, and a figure.
+"""Shows demonstrations: a summary on the screen, and a figure.
 
 python -m nht.recipes.inspect_demos runs/demos-wam_wipe
 """
@@ -10,28 +10,28 @@ from pathlib import Path
 import nht
 from nht.minari_internals import FOLDER, METADATA
 from nht.recipes.config import InspectDemos
-from nht.recipes.data.figure import draw, save
+from nht.recipes.data.figure import draw_figure, save
 from nht.recipes.data.files import Episodes, read_episodes
-from nht.recipes.data.summary import ranges, summary
+from nht.recipes.data.summary import demos_summary, ranges
 from nht.recipes.launch import launch
 from nht.recipes.sections import SourceConfig
 
 
 def main(config: InspectDemos) -> None:
-    """Read, print the summary and draw the figure."""
+    """Read demonstrations, print the summary and draw the figure."""
     if not config.demos:
         raise ValueError("nothing to inspect: name the demonstrations, inspect_demos PATH.")
     if config.directions < 1:
         raise ValueError(f"directions must be at least 1, got {config.directions}.")
-    episodes = read(config.demos)
+    episodes = read_source(config.demos)
     out = Path(config.out or f"{config.demos.rstrip('/')}-inspection.png")
-    print(summary(episodes, config.directions))
+    print(demos_summary(episodes, config.directions))
     print(f"\n{ranges(episodes.data).to_string(index=False)}")
-    save(draw(episodes, config.directions), out)
+    save(draw_figure(episodes, config.directions), out)
     print(f"\nfigure in {out}")
 
 
-def read(path: str) -> Episodes:
+def read_source(path: str) -> Episodes:
     """The episodes of a folder of demonstrations, an HDF5 file, a TensorDict's folder or a Minari dataset.
 
     Raises:

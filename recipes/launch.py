@@ -30,18 +30,18 @@ from nht.recipes.sections import Training
 Config = TypeVar("Config")
 
 NAMED: dict[str, Table[Any]] = {"env": TASKS, "map": KINDS}
-"""Groups whose choices need no YAML: what the table has, ``env=my_package.tasks:Pour``, is a choice, too."""
+"""Groups whose choices need no YAML: every name or import path of the table is a choice, too."""
 EXPECTED = (ValueError, OSError, ImportError, KeyError, FloatingPointError, MemoryError, RuntimeError)
-"""Errors that say by themselves what is wrong; HYDRA_FULL_ERROR=1 shows where they come from."""
+"""Errors whose message suffices; HYDRA_FULL_ERROR=1 shows their traceback."""
 
 PATIENCE, TURN = 10.0, 2.0
-"""Seconds for which a process that torchrun started lets the first one speak, and more for each before it."""
+"""Seconds that a process of torchrun waits with its error for that of the first, and more for each rank below it."""
 
 
 def launch(
     main: Callable[[Config], object], schema: type[Config], name: str, positional: str | None = None
 ) -> None:
-    """Run ``main`` with the configuration that the command line asks for; say in one line what is wrong with it.
+    """Run ``main`` with the configuration of the command line; print errors in it as one line.
 
     Args:
         main: the recipe.
@@ -66,10 +66,10 @@ def launch(
 
 
 def _let_others_speak(error: BaseException) -> None:
-    """Wait, so that what is wrong with all the processes that torchrun started is said once.
+    """Wait, so that an error of all the processes that torchrun started is printed only once.
 
-    It ends all of them when the first to speak has ended; who is still there after a while is the only one to know.
-    That somebody else has gone is no news of one's own. Launchers that let the others live hear one line from each.
+    torchrun ends all processes when the first has ended: one that is still alive after a while is the only one with the
+    error. The loss of another process is not reported. Launchers that let the others live get one line from each.
     """
     size, rank = (
         int(os.environ.get(name, default)) for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"))
@@ -87,7 +87,7 @@ def _message(error: BaseException) -> str:
 
 
 def _keyed(word: str, positional: str, schema: type[Any] | None = None) -> str:
-    """A word of the command line as a Hydra override; what has no key sets ``positional``."""
+    """A word of the command line as a Hydra override; a word without a key sets ``positional``."""
     names = [entry.name for entry in fields(schema)] if schema is not None else []
     return keyed(word, positional, names, os.path.lexists(Path(word).expanduser()))
 
@@ -111,7 +111,7 @@ def configure(schema: type[Config], name: str, overrides: Sequence[str] = ()) ->
 
 
 def _told(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConfig:
-    """What the command line says, laid over the recipe's values."""
+    """The recipe's values with the overrides of the command line."""
     check_flags(overrides, name)
     texts = [as_text(schema, word) for word in _named(schema, overrides)]
     check_single(schema, texts, name)
@@ -126,7 +126,8 @@ def _mistake(
     schema: type[Any], error: HydraException | OmegaConfBaseException, words: Sequence[str]
 ) -> ValueError:
     rule = rule_for(error, words)
-    return ValueError(f"{reason(error)}. {rule}" if rule else f"{reason(error)}{_existing(schema, error)}")
+    text = f"{reason(error)}. {rule}" if rule else f"{reason(error)}{_existing(schema, error)}"
+    return ValueError(f"{text.removesuffix('.')}.")
 
 
 def _help(main: Callable[..., object], schema: type[Any], name: str, overrides: Sequence[str]) -> str:
@@ -136,7 +137,7 @@ def _help(main: Callable[..., object], schema: type[Any], name: str, overrides: 
 
 
 def _choices(schema: type[Any], name: str) -> dict[str, list[str]]:
-    """The choices of each group that a recipe has: our YAML files, and what stands in tables."""
+    """The choices of each group of a recipe: our YAML files, and the names in the tables."""
     found: dict[str, list[str]] = {}
     with initialize_config_module("nht.configs", version_base="1.3"):
         for entry in fields(schema):
@@ -153,7 +154,7 @@ def _choices(schema: type[Any], name: str) -> dict[str, list[str]]:
 
 
 def _owner(choice: str) -> str | None:
-    """The algorithm that a choice of ``algo`` is of: ``ddpg`` of ``ddpg_paper``."""
+    """The algorithm that a choice of ``algo`` belongs to: ``ddpg`` for ``ddpg_paper``."""
     return next((name for name in ALGORITHMS if choice == name or choice.startswith(f"{name}_")), None)
 
 
@@ -172,7 +173,7 @@ def _check_algorithm(schema: type[Any], overrides: Sequence[str]) -> None:
 
 
 def _named(schema: type[Any], overrides: Sequence[str]) -> Iterator[str]:
-    """Overrides in which a choice that has no YAML of ours is the name that a table of ours knows."""
+    """Overrides in which a choice without a YAML file of ours is replaced by its name in the table."""
     for word in overrides:
         key, _, value = word.partition("=")
         known = NAMED.get(key)
@@ -192,7 +193,7 @@ def _has_yaml(group: str, choice: str) -> bool:
 
 
 def _at_home(config: Any) -> Any:
-    """A configuration in whose paths ``~`` is the user's home."""
+    """A configuration with ``~`` in its paths replaced by the user's home."""
     for entry in fields(config):
         value = getattr(config, entry.name)
         if is_dataclass(value):
@@ -213,7 +214,7 @@ def _compose(schema: type[Any], name: str, overrides: Sequence[str]) -> DictConf
 
 
 def _primary(schema: type[Any], name: str) -> str:
-    """The recipe's YAML file; of a recipe without one, what any training starts from."""
+    """The recipe's YAML file; for a recipe without one, the file that any training starts from."""
     if name in choices(""):
         return name
     groups: list[Any] = [f"{name}_schema"]
@@ -227,7 +228,7 @@ def _primary(schema: type[Any], name: str) -> str:
 
 
 def _opened(node: DictConfig) -> DictConfig:
-    """Let the dictionaries in it take new keys, which their readers check; dataclasses stay as they are."""
+    """Let dictionaries in the configuration take new keys, which their readers check; dataclasses stay closed."""
     for key in node:
         value = None if OmegaConf.is_missing(node, key) else node[key]
         if isinstance(value, DictConfig):

@@ -1,4 +1,4 @@
-"""Words of the command line, made ready for Hydra's grammar: text may hold any character, and a word says one value."""
+"""Prepares words of the command line for Hydra's grammar: text may hold any character, and a word has one value."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import GrammarParseError, InterpolationResolutionError, OmegaConfBaseException
 
 QUOTED = re.compile(r"'(\\.|[^'\\])*'|\"(\\.|[^\"\\])*\"", re.DOTALL)
-"""Text that stands in quotes of Hydra's, from its first character to its last."""
+"""Text that is quoted in Hydra's way from its first character to its last."""
 
 LIST_RULE = (
     "Text in a list or mapping that holds commas, brackets, = or quotes stands in quotes, and the word in the shell's: "
@@ -25,19 +25,19 @@ REFERENCE_RULE = (
 
 
 def quoted(text: str) -> str:
-    """``text`` in quotes of Hydra's, whatever it holds."""
+    """``text`` quoted in Hydra's way, whatever it holds."""
     escaped = re.sub(r"(\\+)(?='|$)", r"\1\1", text).replace("'", r"\'")
     return f"'{escaped}'"
 
 
 def keyed(word: str, positional: str, names: Sequence[str], is_path: bool) -> str:
-    """A word of the command line as an override: what has no key sets ``positional``.
+    """A word of the command line as an override: a word without a key sets ``positional``.
 
     Args:
         word: as it was typed; a path may hold any character, an equals sign included.
         positional: setting that a word without a key sets.
-        names: of the recipe's settings, of which a key is one.
-        is_path: whether something lies at the path that the word would be.
+        names: of the recipe's settings, which are the possible keys.
+        is_path: whether a file or folder exists at the path that the word would be.
     """
     key, equals, _ = word.partition("=")
     looks_keyed = equals and re.fullmatch(r"[+~]{0,2}[A-Za-z_][\w./@]*", key) and "/" not in key
@@ -47,7 +47,7 @@ def keyed(word: str, positional: str, names: Sequence[str], is_path: bool) -> st
 
 
 def as_text(schema: type[Any], word: str) -> str:
-    """An override with its value quoted if it is text, as titles and paths are, or a plain list of texts."""
+    """An override whose value is quoted if it is text, as titles and paths are, or a plain list of texts."""
     key, equals, value = word.partition("=")
     if not equals or QUOTED.fullmatch(value):
         return word
@@ -59,7 +59,7 @@ def as_text(schema: type[Any], word: str) -> str:
 
 
 def _listed(value: str) -> list[str]:
-    """The texts of a list that commas outside of brackets divide; none if it holds quotes, or brackets do not match."""
+    """The texts of a list, split at commas outside of brackets; none if it has quotes or unmatched brackets."""
     if not re.fullmatch(r"\[[^'\"\\]*\]", value, re.DOTALL) or not value[1:-1].strip():
         return []
     texts, open_brackets = [""], ""
@@ -78,7 +78,7 @@ def _listed(value: str) -> list[str]:
 
 
 def type_of(schema: type[Any], key: str) -> str | None:
-    """The type of the field at a dotted name, as it is written there; None if there is no such field."""
+    """The annotation of the field at a dotted name, as text; None if there is no such field."""
     node: Any = schema
     *outer, last = key.split(".")
     for part in outer:
@@ -95,7 +95,7 @@ def section(entry: Any) -> Any:
 
 
 def check_flags(words: Sequence[str], recipe: str) -> None:
-    """Raise ValueError for a word that is a flag: there is none but ``--help``."""
+    """Raise ValueError for a word that is a flag: the only flag is ``--help``."""
     for flag in (word for word in words if word.startswith("-")):
         if flag in ("-m", "--multirun"):
             raise ValueError(
@@ -131,7 +131,7 @@ def _loop(key: str, values: str, recipe: str) -> str:
 
 
 def rule_for(error: HydraException | OmegaConfBaseException, words: Sequence[str]) -> str:
-    """How to write what the grammar did not take, where that was the mistake; else nothing."""
+    """A hint how to write what Hydra's grammar refused; empty for other errors."""
     kinds = (GrammarParseError, InterpolationResolutionError)
     if any("${" in word for word in words) and (
         isinstance(error, kinds) or isinstance(error.__cause__, kinds)

@@ -1,4 +1,4 @@
-"""Progress bars: drawn over and over on a terminal, a line a minute in a log file."""
+"""Progress bars: redrawn on a terminal, one line per minute in a log file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 from tqdm import tqdm
 
 TERMINAL, LOG = 0.1, 60.0
-"""Seconds between two drawings of a bar, at least."""
+"""Least time between two drawings of a bar [s]."""
 
 
 def progress_bar(total: int, desc: str, unit: str, **more: Any) -> tqdm[Any]:
     """A bar over ``total`` units of work.
 
     Args:
-        total: of them.
+        total: number of units.
         desc: what is done.
         unit: what is counted, e.g. ``"step"``.
         more: further arguments of ``tqdm``.
@@ -33,6 +33,6 @@ def progress_bar(total: int, desc: str, unit: str, **more: Any) -> tqdm[Any]:
 
 
 def show_beside(bar: tqdm[Any], **values: Any) -> None:
-    """Say ``values`` beside a bar: at once on a terminal, with the next drawing in a log file."""
+    """Show ``values`` beside a bar: at once on a terminal, with the next line in a log file."""
     if not bar.disable:
         bar.set_postfix(values, refresh=bar.mininterval < LOG)

@@ -1,4 +1,4 @@
-"""What libraries tell their own developers does not reach the user of a recipe."""
+"""Silences messages of libraries that are for their developers, not for the users of recipes."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import os
 import warnings
 
 LEVEL = "RL_LOGGING_LEVEL"
-"""The variable by which TorchRL takes the level of its log; one that the user has set stays."""
+"""The environment variable with TorchRL's log level; a value that the user has set stays."""
 
 
 def quiet_libraries() -> None:
-    """Leave out TorchRL's reports of storages it has made, and its warning of targets that we move ourselves.
+    """Silence TorchRL's reports of new storages, and its warning about target networks that we update ourselves.
 
     Worker processes that start later inherit both.
     """

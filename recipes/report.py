@@ -1,4 +1,4 @@
-"""Finished runs side by side, as a table and learning curves; or a whole search, as figures and a page.
+"""Compare finished runs in a table and learning curves; or report a whole search in figures and a page.
 
 python -m nht.recipes.report runs/demo
 python -m nht.recipes.report runs/search-wam_wipe

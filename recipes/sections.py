@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 DEFAULT_SCALE = "default"
-"""Of ``map.action_scale``: what the kind of map says."""
+"""The value of ``map.action_scale`` that stands for the default of the kind of map."""
 
 MOST_THREADS = 1_024
-"""That a task may be stepped by: each has a simulation of its own, and a configuration may be a stranger's."""
+"""Limit of a task's threads, each with its own simulation, as configurations may come from strangers."""
 
 
 def path_field(default: str | None) -> Any:
@@ -56,7 +56,7 @@ class DemosConfig:
 
 @dataclass
 class SourceConfig:
-    """What ``collect_demos`` makes demonstrations from. Keys may be nested: ``info/goal``."""
+    """Where ``collect_demos`` takes demonstrations from. Keys may be nested: ``info/goal``."""
 
     kind: str = "expert"  # expert, policy, minari, hdf5 or tensordict
     path: str | None = path_field(None)  # run folder; Minari id, folder or file; HDF5 file; TensorDict folder
@@ -95,7 +95,7 @@ class MapConfig:
     action_scale: Any = DEFAULT_SCALE
 
     def __post_init__(self) -> None:
-        """Raise ValueError for corrections without a positive size, or an action scale that is none."""
+        """Raise ValueError for corrections without a positive size, or an invalid action scale."""
         if self.residual is not None and not self.residual > 0:
             raise ValueError(
                 f"map.residual must be positive, or null for no corrections, got {self.residual}."
@@ -111,15 +111,15 @@ class MapConfig:
 
     @property
     def scale_is_set(self) -> bool:
-        """Whether ``action_scale`` was said, null included."""
+        """Whether ``action_scale`` was set, null included."""
         return self.action_scale != DEFAULT_SCALE
 
 
 @dataclass
 class AlgoConfig:
-    """What every algorithm has: how many environment steps, and how many of them between two rounds of updates.
+    """Settings of every algorithm: how many environment steps in all, and between two rounds of updates.
 
-    ``varies`` names the settings in which learners that share every call may differ; none, if they cannot share any.
+    ``varies`` names the settings in which learners that train together may differ; empty if they cannot train together.
     """
 
     varies: ClassVar[tuple[str, ...]] = ()
@@ -132,13 +132,13 @@ class AlgoConfig:
 
 @dataclass
 class CollectorConfig:
-    """Which processes step the copies."""
+    """Which processes step the copies of the task."""
 
     kind: str = "single"  # this one; or multi_sync, multi_async: workers beside it
     num_workers: int = 1  # of each learner, which share its copies
 
     def __post_init__(self) -> None:
-        """Raise ValueError for an unknown kind, or a number of workers that does not go with it."""
+        """Raise ValueError for an unknown kind of collector, or a number of workers that it cannot have."""
         if self.kind not in ("single", "multi_sync", "multi_async"):
             raise ValueError(f"collector.kind must be single, multi_sync or multi_async, got {self.kind!r}.")
         if self.num_workers < 1:
@@ -152,7 +152,7 @@ class CollectorConfig:
 
 @dataclass
 class EvaluationConfig:
-    """Deterministic episodes on environments and seeds of their own."""
+    """Settings of test episodes, which are deterministic and have their own environments and seeds."""
 
     every: int = 10_000  # frames between two evaluations
     episodes: int = 100  # in each, one copy of the task for every episode
@@ -162,7 +162,7 @@ class EvaluationConfig:
 
 @dataclass
 class RunConfig:
-    """Where a run writes, and whether it goes on from what it finds there."""
+    """Where a run writes, and whether it resumes a run that it finds there."""
 
     folder: str = path_field("")  # of this run alone
     resume: Any = False  # true, or auto: go on if the folder holds a run, else begin
@@ -173,14 +173,14 @@ class RunConfig:
     wandb_job_type: str | None = None  # and as what
 
     def __post_init__(self) -> None:
-        """Raise ValueError for another way to resume."""
+        """Raise ValueError for an unknown value of ``resume``."""
         if self.resume not in (True, False, "auto"):
             raise ValueError(f"run.resume must be true, false or auto, got {self.resume!r}.")
 
 
 @dataclass
 class Training:
-    """A run of an algorithm on a task, through an action map."""
+    """All settings of a run: an algorithm on a task, through an action map."""
 
     env: EnvConfig = field(default_factory=EnvConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)

@@ -27,7 +27,7 @@ from nht.recipes.run.record import Record
 
 
 def main(config: TD3) -> None:
-    """Train, evaluate on the way, and say at the end what happened."""
+    """Train, evaluate on the way, and print a summary at the end."""
     algo = config.algo
     ranks = Ranks(config.device, seed=config.seed, threads=config.torch_threads, tf32=config.tf32)
     folder = RunFolder(config, ranks)

@@ -15,10 +15,10 @@ def lerp_all(values: Sequence[Tensor], ends: Sequence[Tensor], weight: float) ->
 
 
 def layout_versions(state: Mapping[Any, Any]) -> Any:
-    """The versions of their layouts that modules put beside a state dictionary, in ``_metadata``; None without."""
+    """The layout versions that modules store with a state dictionary, in ``_metadata``; None if there are none."""
     return getattr(state, "_metadata", None)
 
 
 def set_layout_versions(state: dict[Any, Any], versions: Any) -> None:
-    """Put them there again: ``load_state_dict`` looks at ``_metadata``."""
+    """Store layout versions with a state dictionary again: ``load_state_dict`` reads ``_metadata``."""
     state._metadata = versions  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ from torchrl.objectives import SoftUpdate
 
 
 class FirstComeCollector(MultiAsyncCollector):
-    """``MultiAsyncCollector`` that tells from which worker the latest batch came.
+    """A ``MultiAsyncCollector`` that knows which worker the latest batch came from.
 
     Relies on ``_get_from_queue``, which gives a worker's number first.
 
@@ -30,17 +30,17 @@ class FirstComeCollector(MultiAsyncCollector):
 
 
 def counted_frames(collector: BaseCollector) -> int:
-    """How many steps a collector has counted, by which it ends its random ones: ``_frames``."""
+    """Number of steps that a collector has counted, which decides when its random steps end: ``_frames``."""
     return int(collector._frames)
 
 
 def count_frames_from(collector: BaseCollector, frames: int) -> None:
-    """Let a collector go on counting from ``frames``."""
+    """Set the number of steps that a collector has counted."""
     collector._frames = frames
 
 
 def carrier(collector: Collector) -> TensorDictBase:
-    """What the next step of a collector starts from, observation and state of the exploration: ``_carrier``."""
+    """The data that a collector's next step starts from, observation and state of the exploration: ``_carrier``."""
     found: TensorDictBase = collector._carrier
     return found
 
@@ -48,7 +48,7 @@ def carrier(collector: Collector) -> TensorDictBase:
 def ended_workers(collector: BaseCollector) -> dict[int, int]:
     """The workers of a parallel collector that have ended, by number, with their exit codes.
 
-    Relies on ``procs``, the workers' processes in order; TorchRL closes the others of one that it finds dead.
+    Relies on ``procs``, the workers' processes in order; TorchRL closes the others when it finds one dead.
     """
     ended = {}
     for number, process in enumerate(collector.procs):
@@ -66,7 +66,7 @@ def kill_workers(collector: BaseCollector) -> None:
 
 
 def followed_pairs(updater: SoftUpdate) -> Iterator[tuple[Tensor, Tensor]]:
-    """The leaves that target networks follow, each with its target: ``_sources`` and ``_targets``."""
+    """Pairs of a parameter and the target parameter that follows it: ``_sources`` and ``_targets``."""
     for name in updater._sources.keys():  # noqa: SIM118 - a TensorDict iterates over its rows
         sources = updater._sources[name].values(True, True)
         targets = updater._targets[f"target_{name}"].values(True, True)

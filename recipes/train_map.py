@@ -12,7 +12,7 @@ import torch
 import nht
 from nht.recipes.config import TrainMap
 from nht.recipes.launch import launch
-from nht.recipes.maps.interface import train_map
+from nht.recipes.maps.interface import trained_map
 from nht.recipes.run.ranks import usable_device
 
 
@@ -23,7 +23,7 @@ def main(config: TrainMap) -> None:
         raise FileExistsError(f"{out} exists: maps are never overwritten. Choose another file.")
     device = usable_device(config.device)
     torch.set_num_threads(config.torch_threads)
-    trained = train_map(config.map, config.env, config.demos, config.seed, str(device), align=config.align)
+    trained = trained_map(config.map, config.env, config.demos, config.seed, str(device), align=config.align)
     nht.save_map(trained.map, out)
     for name, value in trained.metrics.items():
         print(f"{name:>20}  {value:.6g}")

@@ -1,4 +1,4 @@
-"""What puts an action map between a policy and an environment: a TorchRL transform, and Gymnasium wrappers."""
+"""A TorchRL transform and Gymnasium wrappers that put an action map between a policy and an environment."""
 
 from __future__ import annotations
 

@@ -23,29 +23,30 @@ class ActionMapTransform(Attachment):
 
         actuation = map.decode(action, context), within the limits of the environment's own action spec
 
-    What an action means, its scale and what happens at the limits, is the map's alone: see ``nht.ActionMap``.
+    The map alone decides what an action means: its scale, and what happens at the limits. See ``nht.ActionMap``.
 
-    The map sees the raw context, that of ``env.base_env``, wherever this transform stands among others. TorchRL
+    The map sees the raw context, as ``env.base_env`` gives it, wherever this transform stands among others. TorchRL
     inverts actions only after all transforms have rewritten the observation; a copy of the raw context therefore
-    travels in the tensordict. It is taken before the transforms in front of this one run; their places, indices and
-    saved states are those of a chain without a map. Only if an entry of the context is itself made by a transform in
-    front, say the tool's position from joint angles, all of it is read here.
+    travels in the tensordict. It is taken before the transforms in front of this one run; the chain's order, indices
+    and saved states stay as they are without a map. Only if a transform in front makes an entry of the context, say the
+    tool's position from joint angles, the whole context is read here instead.
 
     Three entries stand in the data, registered in the specs:
 
     - ``action_key``, (*batch, k): the policy's action, as it gave it.
     - ``context_key``, (*batch, context_dim): the raw context. Left out if the map's ``context_dim`` is 0.
-    - ``executed_key``, (*batch, n): under "next", the actuation that the environment got in this step; at the root,
-      hence, that of the step before, and zero after a reset. A copy whose step was skipped keeps it as it was.
+    - ``executed_key``, (*batch, n): under "next", the actuation that the environment executed in this step; at the
+      root, that of the step before, zero after a reset. A copy whose step was skipped keeps its last value.
 
     Transforms that step the environment again, such as ``FrameSkipTransform``, repeat the actuation, in whichever
     order they stand. Where the environment's action spec is unbounded, or where there is no environment, nothing is
     limited. Policies see the map's dtype, environments that of their own spec. The map is copied, frozen and kept in
     eval mode; nothing that depends on the course of an episode stays in this module.
 
-    ``forward`` is the way back, for replay buffers and demonstrations: it reads ``actuation_key`` and the context
-    keys, and writes ``map.encode(actuation, context)`` to ``action_key``, not limited. As ``ReplayBuffer.extend``
-    calls ``inv``, a buffer that is written to needs an instance with ``forward_only=True``, whose ``inv`` does nothing.
+    ``forward`` goes from actuation to action, for replay buffers and demonstrations: it reads ``actuation_key`` and the
+    context keys, and writes ``map.encode(actuation, context)`` to ``action_key``, not limited. As
+    ``ReplayBuffer.extend`` calls ``inv``, a buffer that is written to needs an instance with ``forward_only=True``,
+    whose ``inv`` does nothing.
 
     Args:
         map: any action map, or the path of its file.
@@ -57,14 +58,14 @@ class ActionMapTransform(Attachment):
         actuation_key: the environment's own action; in a replay buffer, the recorded actuation.
         context_key: the copy of the context.
         executed_key: the executed actuation.
-        forward_only: for replay buffers. To attach such an instance to an environment is an error.
+        forward_only: for replay buffers. Attaching such an instance to an environment raises an error.
         allow: modules that may be imported for the class of a map in a file, see ``nht.load_map``.
 
     Raises:
         TypeError: if ``map`` is neither map nor path; on attaching, if a context entry or the actuation is not of
             floats.
         FileNotFoundError: if there is no such file.
-        ValueError: on a file that is none of a map, on an ``action_scale`` that is not positive and finite, on another
+        ValueError: on a file that holds no map, on an ``action_scale`` that is not positive and finite, on another
             ``saturation``, on context keys that are missing or in another order than the map's, on keys that collide;
             on attaching, if the width of context or actuation is not the map's, if the environment has entries of its
             own under our keys, or if the raw context cannot be read because of other transforms; at a step, if the
@@ -114,7 +115,7 @@ class ActionMapTransform(Attachment):
 
     @property
     def action_scale(self) -> Tensor:
-        """What a policy's action of 1 stands for, a scalar: the map's."""
+        """The map's action scale, a scalar: what a policy's action of 1 stands for."""
         return self.map.action_scale
 
     def train(self, mode: bool = True) -> ActionMapTransform:
@@ -144,7 +145,7 @@ class ActionMapTransform(Attachment):
         return tensordict.set(self.actuation_key, self.map.decode(action, context, self._low, self._high))
 
     def _check_not_recorded(self, tensordict: TensorDictBase, action: Tensor, context: Tensor | None) -> None:
-        """Without an environment: data that are no policy's action in its context are those of a replay buffer."""
+        """Without an environment, refuse data that have no policy's action and context: they are of a replay buffer."""
         if context is None or "next" in tensordict or action.shape[-1] != self.map.action_dim:
             beside = f" and {self.context_key!r}" if self.context_keys else ""
             raise ValueError(
@@ -170,7 +171,7 @@ class ActionMapTransform(Attachment):
         return tensordict_reset.set(self.executed_key, idle)
 
     def _see_to_context(self, observed: TensorDictBase) -> None:
-        """Read it, or make sure that what was read early is still there."""
+        """Read the context, or make sure that the one that was read early is still there."""
         if not self.context_keys:
             return
         if not self.reads_early:
@@ -189,6 +190,6 @@ class ActionMapTransform(Attachment):
 def _take_old_action_scale(
     _module: nn.Module, state_dict: dict[str, Any], prefix: str, *_others: object
 ) -> None:
-    """States saved earlier: the transform had an action scale of its own, which held instead of the map's."""
+    """Accept states of earlier versions, in which the transform had its own action scale in place of the map's."""
     if f"{prefix}action_scale" in state_dict:
         state_dict[f"{prefix}map.action_scale"] = state_dict.pop(f"{prefix}action_scale")

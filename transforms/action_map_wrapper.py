@@ -26,7 +26,7 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
 
         actuation = map.decode(action, context), within the limits of the environment's own action space
 
-    What an action means, its scale and what happens at the limits, is the map's alone: see ``nht.ActionMap``.
+    The map alone decides what an action means: its scale, and what happens at the limits. See ``nht.ActionMap``.
 
     The context is read from what ``reset`` and ``step`` return: an entry of a Dict observation, ``"observation"`` for
     any other observation, or else an entry of ``info``, such as the raw keys of ``nht.envs``. The observation is that
@@ -50,7 +50,7 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
         TypeError: if ``env`` or ``map`` is none, or on actions or, here or at the first reset, a context entry that is
             not of floats.
         FileNotFoundError: if there is no such file of a map.
-        ValueError: on a file that is none of a map, on an ``action_scale`` that is not positive and finite, on another
+        ValueError: on a file that holds no map, on an ``action_scale`` that is not positive and finite, on another
             ``saturation``, on context keys that are missing or in another order than the map's; if the width of the
             actuation or, here or at the first reset, of the context is not the map's; at a step, on an action of
             another shape.
@@ -95,7 +95,7 @@ class ActionMapWrapper(gymnasium.Wrapper[Any, Floats, Any, Floats], RecordConstr
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]  # a property in Gymnasium's own Wrapper too
-        """What ``gymnasium.make`` makes this environment of again, wrapper and map included."""
+        """The specification from which ``gymnasium.make`` makes this environment again, with wrapper and map."""
         spec = super().spec
         if spec is None or self._map_has_a_file:
             return spec
@@ -207,7 +207,7 @@ class ActionMapVectorWrapper(VectorWrapper[Any, Floats, Any, Floats, NDArray[Any
 
 
 def _as_json(keys: Sequence[NestedKey] | None) -> list[Any] | None:
-    """Keys as JSON has them, nested ones in a list."""
+    """Keys in JSON, where a nested key is a list."""
     if keys is None:
         return None
     listed = [keys] if isinstance(keys, str) else keys

@@ -1,4 +1,4 @@
-"""What an environment's specs say about the actuation that a map has to make."""
+"""Reads from an environment's specs which actuation a map has to make."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ which an ObservationNorm without statistics cannot tell yet."""
 
 
 def transformed_action_spec(base: EnvBase, ahead: Sequence[Transform]) -> Composite:
-    """The environment's actions, as the transforms ahead leave them."""
+    """The action spec of the environment after the transforms ahead."""
     spec = base.input_spec.clone()
     for transform in ahead:
         if not isinstance(transform, STATE_ONLY):
@@ -27,7 +27,7 @@ def transformed_action_spec(base: EnvBase, ahead: Sequence[Transform]) -> Compos
 
 
 def transformed_observation_spec(base: EnvBase, ahead: Sequence[Transform]) -> Composite:
-    """What the environment observes, as the transforms ahead leave it."""
+    """The observation spec of the environment after the transforms ahead."""
     spec = base.output_spec.clone()
     for transform in ahead:
         spec = transform.transform_output_spec(spec)
@@ -59,7 +59,7 @@ def find_actuation_spec(action_spec: Composite, key: NestedKey, actuation_dim: i
 
 
 def limits(spec: TensorSpec, batch_dims: int) -> tuple[Tensor, Tensor]:
-    """Low and high, infinite if there are none: one copy's, or, if the copies' limits differ, those of all."""
+    """Lowest and highest actuation, infinite if unbounded: of one copy, or of all copies if their limits differ."""
     if isinstance(spec, Stacked):
         lows, highs = zip(*(limits(part, 0) for part in spec.unbind(spec.stack_dim)), strict=True)
         return torch.stack(lows, spec.stack_dim), torch.stack(highs, spec.stack_dim)

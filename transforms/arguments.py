@@ -1,4 +1,4 @@
-"""What everything that puts a map before an environment makes of its arguments; TorchRL is not needed for it."""
+"""Arguments that the transform and the wrappers share, checked and resolved; needs no TorchRL."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def take_map(
     saturation: Saturation | None = None,
     allow: Sequence[str] = (),
 ) -> ActionMap:
-    """A map of one's own, from a map or its file: frozen and in eval mode, with scale and saturation laid over.
+    """A copy of a map, or the map in a file: frozen and in eval mode, with the given scale and saturation.
 
     Args:
         map: a map, of which this is a copy, or the path of a file of ``nht.save_map``.
@@ -32,8 +32,8 @@ def take_map(
     Raises:
         TypeError: if ``map`` is neither.
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is none of a map; if the action scale, given or the map's own, is not positive and
-            finite; on another saturation.
+        ValueError: if the file holds no map; if the action scale, given or the map's own, is not positive and finite;
+            on another saturation.
     """
     if isinstance(map, str | Path):
         taken = load_map(map, allow=allow)
@@ -51,10 +51,10 @@ def take_map(
 
 
 def resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> list[NestedKey]:
-    """The entries that, side by side, are the map's context; none if its context is empty.
+    """Keys of the entries that are concatenated into the map's context; none if its context is empty.
 
     Args:
-        map: whose own keys hold where none are given.
+        map: its own keys are the default.
         given: keys; a nested one is a tuple, or a list as in JSON and YAML, within a list.
 
     Raises:
@@ -79,7 +79,7 @@ def resolve_context_keys(map: ActionMap, given: Sequence[NestedKey] | None) -> l
 
 
 def check_distinct(action_keys: set[NestedKey], context_key: NestedKey, executed_key: NestedKey) -> None:
-    """No two entries have one key, but that the policy's action may stand where the actuation does.
+    """Check that no two entries have the same key; only the policy's action may share the actuation's.
 
     Raises:
         ValueError: if two have.

@@ -1,4 +1,4 @@
-"""What a transform around an action map finds out about its environment, and what it tells TorchRL about its data."""
+"""How a transform with an action map reads its environment's specs, and declares its own entries to TorchRL."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from nht.transforms.torchrl_internals import (
 
 
 class Attachment(EarlyReader):
-    """A transform with an action map: its keys, and what holds for all steps in the environment around it.
+    """A transform with an action map: its keys, and what it knows about the environment around it.
 
     Attributes:
         map: the transform's own.
-        context_keys: the entries that are the map's context; none if that is empty.
+        context_keys: keys of the entries of the map's context; none if that is empty.
         action_key, actuation_key, context_key, executed_key, forward_only: as of ``ActionMapTransform``.
     """
 
@@ -51,13 +51,13 @@ class Attachment(EarlyReader):
     _is_current = True
 
     def _register_limits(self) -> None:
-        """They belong to the environment: found on attaching, not saved."""
+        """Register the limits as buffers, not saved: they belong to the environment and are read on attaching."""
         self.register_buffer("_low", None, persistent=False)
         self.register_buffer("_high", None, persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the map, hence of actions and context."""
+        """The map's precision, which actions and context have, too."""
         return self.map.action_scale.dtype
 
     def clone(self) -> Self:
@@ -81,7 +81,7 @@ class Attachment(EarlyReader):
         self._attach()
 
     def transform_action_spec(self, action_spec: Composite) -> Composite:
-        """The environment's actuation gives way to the policy's action."""
+        """Replace the environment's actuation by the policy's action."""
         self._attach()  # again, for transforms may have been inserted since
         actuation_spec = action_spec[self.actuation_key]
         del action_spec[self.actuation_key]
@@ -115,16 +115,16 @@ class Attachment(EarlyReader):
         return spec
 
     def before_reset(self) -> None:
-        """Look around again, if the chain has changed since."""
+        """Read the chain again if it has changed."""
         self._check_place()
 
     def _check_place(self) -> None:
-        """Look around again, if the chain has changed since. To be called before the environment is."""
+        """Read the chain again if it has changed; to be called before the environment is stepped."""
         if not self._is_current:
             self._attach()
 
     def _attach(self) -> None:
-        """Check map against environment, if there is one by now, and read what holds for all steps."""
+        """Check the map against the environment, if there is one by now, and read what holds for all steps."""
         self._is_current = True
         env, chain, ahead = surroundings(self)
         if env is None:
@@ -153,7 +153,7 @@ class Attachment(EarlyReader):
     def _attach_context(
         self, base: EnvBase, chain: Compose | None, ahead: list[Transform], made: set[NestedKey]
     ) -> None:
-        """Find out who has to read the context, and when; ``made`` are the keys that other transforms make."""
+        """Decide where in the chain the context is read; ``made`` are the keys that other transforms make."""
         observation_spec = base.full_observation_spec
         if made and ahead:
             check_writers(ahead, self.context_keys, made)

@@ -1,4 +1,4 @@
-"""The raw context in TorchRL's data, and what must hold of it."""
+"""Reads and checks the raw context in TorchRL's data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read_context(tensordict: TensorDictBase, keys: Sequence[NestedKey], dtype: t
 def check_context(
     observation_spec: Composite, keys: Sequence[NestedKey], lead: torch.Size, context_dim: int
 ) -> None:
-    """Every key is there, of floats, of shape (*lead, width), and the widths add up to the map's context.
+    """Check that every key is there, of floats, shaped (*lead, width), and that the widths add up to the map's.
 
     Raises:
         KeyError: if one is not there.
@@ -55,7 +55,7 @@ def check_context(
 
 
 def check_writers(ahead: Sequence[Transform], keys: Sequence[NestedKey], made: set[NestedKey]) -> None:
-    """No transform ahead rewrites a context entry that another one, or the environment, made.
+    """Check that no transform ahead rewrites a context entry that another one, or the environment, made.
 
     Raises:
         ValueError: if one does.

@@ -1,4 +1,4 @@
-"""Where Gymnasium's data hold the context, and the way from action to actuation, in NumPy's arrays."""
+"""Finds the context in Gymnasium's data, and turns actions into actuations, in NumPy arrays."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Flags = NDArray[np.bool_]
 
 
 class GymnasiumMapping:
-    """What both wrappers share: where the context stands, and the way from action to actuation.
+    """What both wrappers share: finding the context, and turning actions into actuations.
 
     Args:
         map: the wrapper's own, see ``take_map``.
@@ -52,7 +52,7 @@ class GymnasiumMapping:
             self._check(observed)
 
     def context(self, observation: Any, info: dict[str, Any], rows: Flags | None = None) -> Floats:
-        """The context (*lead, context_dim); of the copies ``rows`` (N,), all by default, it must be there."""
+        """The context (*lead, context_dim); it must be there for the copies ``rows`` (N,), by default for all."""
         observed = _by_key(observation)
         values = {}
         for key in self.keys:
@@ -81,7 +81,7 @@ class GymnasiumMapping:
         return value
 
     def _check(self, entries: Mapping[NestedKey, Any]) -> None:
-        """Every entry, an array or a space, is of floats and fits, and the widths add up to the map's context."""
+        """Check that every entry, an array or a space, is of floats and that the widths add up to the map's."""
         widths = {}
         for key, entry in entries.items():
             if entry.dtype is None or not np.issubdtype(entry.dtype, np.floating):
@@ -112,7 +112,7 @@ class GymnasiumMapping:
 
 
 def _numpy_dtype(dtype: torch.dtype) -> type[np.floating[Any]]:
-    """NumPy's floats for a map's; single precision for those that NumPy lacks."""
+    """The NumPy type for a map's dtype; single precision where NumPy has none."""
     if dtype == torch.float64:
         return np.float64
     return np.float16 if dtype == torch.float16 else np.float32
@@ -129,7 +129,7 @@ def _actuation_space(space: Space[Any], shape: tuple[int, ...]) -> Box:
 
 
 def _by_key(observation: Any) -> Mapping[str, Any]:
-    """A Dict observation, or its space, as it is; any other under ``"observation"``."""
+    """A Dict observation or space unchanged; any other under the key ``"observation"``."""
     return observation if isinstance(observation, Mapping) else {"observation": observation}
 
 

@@ -1,4 +1,4 @@
-"""Steps that another transform makes again with the input of the step before: they repeat the actuation."""
+"""Recognises steps that another transform repeats with the same input: they repeat the actuation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class Repeats:
-    """Remembers, in the input of a step, which policy's action became the actuation that stands in its place.
+    """Remembers, in the input of a step, the policy's action and the actuation that replaced it.
 
     A transform behind the map, such as ``FrameSkipTransform``, may step the environment again with the input of a
     step that was made. Where action and actuation have the same key, the actuation stands there by then, and to map
@@ -26,7 +26,7 @@ class Repeats:
         self.given_key, self.executed_key = f"_given_{suffix}", f"_executed_{suffix}"
 
     def policy_action(self, tensordict: TensorDictBase, found: Tensor) -> Tensor:
-        """The policy's action: what was found in the input of a step, unless that was executed before."""
+        """The policy's action: what the input of a step has, or the remembered one if that was executed before."""
         if not self.possible:
             return found
         executed = tensordict.get(self.executed_key, None)

@@ -13,7 +13,7 @@ from torchrl.envs.transforms import Compose, Transform, VecGymEnvTransform
 
 
 class EarlyReader(Transform):
-    """A transform that may have to read observations before transforms that run ahead of it rewrite them.
+    """A transform that may read observations before the transforms ahead of it rewrite them.
 
     Attributes:
         reads_early: whether ``read_raw`` is called, by the chain around it, before the first rewriter runs.
@@ -35,7 +35,7 @@ class EarlyReader(Transform):
 
 
 def containers(transform: Transform) -> Iterator[Compose | EnvBase]:
-    """What is around a transform, from the innermost Compose to the environment, as far as there is one.
+    """The containers of a transform, from the innermost Compose to the environment, if there is one.
 
     Relies on ``Transform._container``, a weak reference to the next one or None. The public ``Transform.container``
     gives the environment alone, and fails where a Compose has none yet.
@@ -67,7 +67,7 @@ def surroundings(transform: Transform) -> tuple[EnvBase | None, Compose | None, 
 
 
 def leaves(transform: Transform) -> list[Transform]:
-    """The transforms of nested chains in the order in which they run; one that is no chain, by itself.
+    """The transforms of nested chains in the order in which they run; a transform that is no chain alone.
 
     Relies on ``Compose._step`` and ``_reset`` calling those of their transforms in turn, and doing nothing else.
     """
@@ -101,7 +101,7 @@ def let_read_early(chain: Compose, also: Sequence[EarlyReader] = ()) -> None:
 class _EarlyReading:
     """What one chain does instead of ``Compose._step``, ``_reset`` and ``_rebuild_up_to``.
 
-    It is no function within another, so that it is copied and pickled with its chain.
+    A class rather than a closure, so that it is copied and pickled with its chain.
     """
 
     def __init__(self, chain: Compose) -> None:
@@ -136,7 +136,7 @@ class _EarlyReading:
 
 
 def completes_the_environment(transform: Transform) -> bool:
-    """Whether a transform is a part of TorchRL's own environments: of vectorised Gym ones, raw is what it leaves."""
+    """Whether a transform belongs to TorchRL's own vectorised Gym environments: raw is what it returns."""
     return isinstance(transform, VecGymEnvTransform)
 
 

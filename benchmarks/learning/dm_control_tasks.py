@@ -1,4 +1,4 @@
-"""Every task of dm_control's suite through an action map: which run.
+"""Runs every task of dm_control's suite through an action map, and reports which work.
 
     MUJOCO_GL=egl OMP_NUM_THREADS=1 python benchmarks/learning/dm_control_tasks.py
 

@@ -1,4 +1,4 @@
-"""What random exploration meets: the share of episodes with a success, by interface, action scale and noise memory.
+"""How random exploration does: the share of episodes with a success, by interface, action scale and noise memory.
 
 Actions are a clipped Ornstein-Uhlenbeck process of standard deviation ``DEVIATION`` in [-1, 1]^k; a memory of 1 step
 is white noise. Failures end an episode, as in training. Every interface is fitted to the same demonstrations. Prints

@@ -1,4 +1,4 @@
-"""What happens at the motors' limits, ``scale`` or ``clip``: learning with either, through the same maps.
+"""Compares the two kinds of saturation, ``scale`` and ``clip``: learning with either, through the same maps.
 
 Three tasks, three seeds each; the action scales are large enough for policies to meet the limits. One process at a
 time. A run that is finished is not repeated, one that was interrupted goes on. Every evaluation is a row of

@@ -2,10 +2,10 @@
 
     OMP_NUM_THREADS=1 python benchmarks/maps/hand_synergies.py
 
-The demonstrations are hand-made, nobody's skill: the arm follows smooth random paths; the fingers close together,
-spread and oppose the thumb with strengths that come and go smoothly, each joint of a finger following the one before it
-more the further the hand is closed, as a grasp does; some tremor. They show that everything runs and what the numbers
-look like; they say nothing of human hands.
+The demonstrations are synthetic: the arm follows smooth random paths; the fingers close together, spread and oppose the
+thumb with strengths that come and go smoothly, each joint of a finger following the one before it more the further the
+hand is closed, as a grasp does; some tremor. They show that everything runs and what the numbers look like; they say
+nothing of human hands.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ import torch
 
 import nht
 from nht.recipes.data.recording import record_expert
-from nht.recipes.maps.interface import train_map
+from nht.recipes.maps.interface import trained_map
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 
@@ -62,7 +62,7 @@ def measured(
     config = MapConfig(kind, max_steps=steps, **settings)
     row = {"map": kind, "configuration": seed, **settings}
     try:
-        map, metrics = train_map(config, ENV, demos, seed)
+        map, metrics = trained_map(config, ENV, demos, seed)
     except FloatingPointError:
         return row | {"error": math.inf, "norm_demos": math.inf}
     map.action_scale.fill_(config.action_scale)

@@ -6,7 +6,7 @@ Contestants, one process, one torch thread, in turn within each round:
 - ``nht-bf16``: the same with ``algo.bfloat16=true``.
 - ``sb3-10`` and ``sb3-1``: stable-baselines3's DDPG on 10 (as many as ours) and on 1 Gymnasium environments.
 
-CPU seconds decide, for other programs may share the cores. Prints the table and writes ``results/ddpg_speed``.
+CPU seconds count, as other programs may share the cores. Prints the table and writes ``results/ddpg_speed``.
 
     OMP_NUM_THREADS=1 python benchmarks/speed/ddpg_speed.py [half_cheetah | wam_wipe] [rounds]
 """

@@ -1,4 +1,4 @@
-"""Whether everything computes on a GPU what it computes on the CPU, and how fast: for a machine that has one.
+"""Checks that a GPU computes the same as the CPU, and how fast.
 
 python benchmarks/speed/gpu_check.py                 # on a GPU, less than ten minutes
 python benchmarks/speed/gpu_check.py --device cpu    # the same steps where there is none
@@ -21,7 +21,7 @@ from nht.recipes.launch import configure
 
 ROOT = Path(__file__).resolve().parents[2]
 TASKS = {"wam_wipe": "nht", "half_cheetah": "none"}
-"""Each with the kind of map that drives it."""
+"""The tasks, each with its kind of map."""
 ALGORITHMS = ("ddpg", "td3", "sac", "ppo")
 OFF_POLICY = ("algo.warmup_frames=0", "algo.updates_per_batch=20", "algo.random_frames=0")
 ON_POLICY = ("algo.frames_per_batch=2000", "env.num_envs=10")
@@ -37,7 +37,7 @@ SHARED = (
     "env.options.max_episode_steps=200",
 )
 TOLERANCE = 0.05
-"""Relative: of the losses' means over the first updates. Sums in another order grow apart as training goes on."""
+"""Relative tolerance of the losses' means over the first updates; rounding differences grow as training goes on."""
 
 
 def main() -> None:
@@ -59,12 +59,12 @@ def main() -> None:
 
 
 def name_of(device: str) -> str:
-    """What computes."""
+    """The name of the device, for messages."""
     return torch.cuda.get_device_name() if device.startswith("cuda") else device
 
 
 def run_tests() -> None:
-    """The tests that need a GPU, which other machines pass over, and those of what must never wait for one."""
+    """Run the tests that need a GPU, and those of code that must never wait for one."""
     files = ["tests/envs/test_envs.py", "tests/transforms/test_transform_specs.py"]
     files += ["tests/nht/test_maps_on_gpus.py", "tests/recipes/agents/test_updates_on_gpus.py"]
     command = [

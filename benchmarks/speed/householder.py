@@ -11,17 +11,16 @@
 - LAPACK: ``torch.linalg.householder_product``, which wants reflectors with zeros before a leading 1. Any k unit vectors
   fit if each gets k more entries in front: what it leaves in there no later reflection sees.
 - LAPACK QR: the same without more entries, as if v_i began with i - 1 zeros, like those of a QR decomposition. It gives
-  *another u*; it stands here for the least that this function can cost.
+  *another u*; it shows the least that this function can cost.
 
 Regimes start from unit reflectors, but for one "from tangents", which includes the exponential map that all share.
 Forward alone runs without gradients, as in a control loop. One thread. After a warm-up all methods take turns in every
 round, in random order, each with a call that is not timed before the one that is; times are the processor's, in which
 other programs do not count, and a ratio is the median over the rounds. Skipped is a method whose matrices would take
 more than 128 MB, and twice what the reflectors take, or that takes longer than 0.5 s, and five times what the library
-takes. Errors are the largest differences between float32 and float64, over 4096 actions of length 1; who is above 1e-6
-cannot be the fastest.
-Writes ``results/householder``, and fails if at batch 4096, n = 7, k = 2, forward and backward, the
-library is not 10 times as fast as the chain.
+takes. Errors are the largest differences between float32 and float64, over 4096 actions of length 1; a method above
+1e-6 cannot be the fastest. Writes ``results/householder``, and fails if at batch 4096, n = 7, k = 2, forward and
+backward, the library is not 10 times as fast as the chain.
 """
 
 import argparse

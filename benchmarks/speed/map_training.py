@@ -21,7 +21,7 @@ from tensordict import TensorDict
 
 import nht
 from nht.recipes.data.recording import record_expert
-from nht.recipes.maps.interface import train_map
+from nht.recipes.maps.interface import trained_map
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.train import _gradient_steps
 
@@ -85,7 +85,7 @@ def main() -> None:
         record_expert(ENV, DemosConfig(transitions=TRANSITIONS), 0, str(demos.path))
         for name, config in MAPS.items():
             start = time.process_time()
-            map, metrics = train_map(config, ENV, demos, seed=0)
+            map, metrics = trained_map(config, ENV, demos, seed=0)
             seconds = time.process_time() - start
             rows.append(
                 {

@@ -43,7 +43,7 @@ from taking_turns import provenance
 import nht
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
-from nht.recipes.study.space import draw
+from nht.recipes.study.space import draw_settings
 
 HERE = Path(__file__).parents[1]
 OUT = HERE / "results" / "population"
@@ -75,14 +75,14 @@ PLAN = {
 
 
 def drawn(learner: int, learners: int) -> dict[str, object]:
-    """What Table 2 gives to one of a pack's learners, whose batch sizes are the nearest to the mean of many."""
-    many = [draw(SPACE, 0, number, "nht") for number in range(8 * learners)]
+    """A draw from Table 2 for one learner of a pack, which has the draws with batch sizes nearest to the mean."""
+    many = [draw_settings(SPACE, 0, number, "nht") for number in range(8 * learners)]
     many.sort(key=lambda one: abs(one["algo.batch_size"] - MEAN_BATCH))
     return {name: value for name, value in many[learner].items() if name.startswith("algo.")}
 
 
 def overrides(setting: str, learner: int, learners: int, folder: Path) -> list[str]:
-    """What one learner is told."""
+    """The overrides of one learner."""
     told = [*SETTINGS[setting], *QUIET, f"seed={learner}", f"run.folder={folder}/{learner}"]
     if setting == "ppo":
         return told

@@ -35,7 +35,7 @@ from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
 from nht.recipes.run.metrics import FRAMES, SUCCESS, tested
 from nht.recipes.run.population import DIVERGED_FILE
-from nht.recipes.study.space import draw
+from nht.recipes.study.space import draw_settings
 
 HERE = Path(__file__).parents[1]
 OUT = HERE / "results" / "population"
@@ -56,7 +56,7 @@ SETTING = (
 
 def learners_of(pack: int, packs: int, learners: int) -> list[int]:
     """The numbers of the learners of one pack: packs have learners of nearly the same batch size."""
-    sizes = {number: draw(SPACE, 0, number, "nht")["algo.batch_size"] for number in range(learners)}
+    sizes = {number: draw_settings(SPACE, 0, number, "nht")["algo.batch_size"] for number in range(learners)}
     in_order = sorted(sizes, key=lambda number: sizes[number])
     return in_order[pack * learners // packs : (pack + 1) * learners // packs]
 
@@ -83,7 +83,7 @@ def train(pack: int, told: argparse.Namespace) -> None:
     for number in own:
         drawn = {
             name.removeprefix("algo."): value
-            for name, value in draw(SPACE, 0, number, "nht").items()
+            for name, value in draw_settings(SPACE, 0, number, "nht").items()
             if name.startswith("algo.")
         }
         run = replace(base.run, folder=str(folder / str(number)))

@@ -8,7 +8,7 @@ Contestants, one process, one torch thread, in turn within each round:
 - ``torchrl``: the settings of TorchRL's own PPO recipe: SerialEnv of GymEnv, VecNorm, GAE anew in each epoch, a replay
   buffer, eager losses.
 
-CPU seconds decide, for other programs may share the cores. Prints the table and writes ``results/ppo_speed``.
+CPU seconds count, as other programs may share the cores. Prints the table and writes ``results/ppo_speed``.
 
     OMP_NUM_THREADS=1 python benchmarks/speed/ppo_speed.py [half_cheetah | wam_wipe] [rounds]
 """

@@ -1,4 +1,4 @@
-"""What a run of the paper's DDPG costs, and what stands beside its arithmetic: searches are thousands of such runs.
+"""What a run of the paper's DDPG costs, and how much of it is not arithmetic: searches are thousands of such runs.
 
 - ``loop``: the recipe at the paper's settings through a 2-dimensional NHT on WAMWipe, two lengths, their difference.
 - ``arithmetic``: the updates that it makes, written out in plain PyTorch (networks, losses, backward, fused Adam,

@@ -1,7 +1,7 @@
 """What a search adds to its runs: Ray, start of workers, demonstrations, files.
 
-A search of a few short runs on raw actuation, one at a time. What of its wall time the runs do not account for
-themselves (``seconds`` of their last evaluation) is overhead, of the whole search and of each run after the first.
+A search of a few short runs on raw actuation, one at a time. Overhead is the wall time beyond what the runs report
+themselves (``seconds`` of their last evaluation): that of the whole search, and that of each run after the first.
 Prints the table and writes ``results/search_overhead/search_overhead.csv``.
 
     OMP_NUM_THREADS=1 python benchmarks/speed/search_overhead.py [seconds of a run of 200,000 steps]

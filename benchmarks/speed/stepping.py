@@ -13,7 +13,7 @@
 
 After a warm-up all take turns in every round, so that a busy machine slows all alike. A ratio is the median over the
 rounds of (env steps/s) / (env steps/s of the bare call with as many copies on one thread). Other programs on the same
-cores disturb it; the CPU ratio, of processor times, they hardly do, and on one thread it means the same. Writes
+cores disturb it, but hardly the CPU ratio, of processor times, which means the same on one thread. Writes
 ``benchmarks/results/stepping/stepping.csv`` and fails if a CPU ratio on one thread is below its floor.
 """
 

@@ -15,9 +15,9 @@ from nht.recipes.agents.returns import return_range, reward_range
 
 
 def critic_network(env: EnvBase, algo: OffPolicyConfig) -> TensorDictModule:
-    """Features and action to a ``"state_action_value"``; a loss makes two critics of it, each with weights of its own.
+    """A critic, features and action to a ``"state_action_value"``; a loss makes two of it, with weights of their own.
 
-    It starts near ``pessimism`` times the lowest return that is possible, or near 0 where rewards know no bound.
+    It starts near ``pessimism`` times the lowest possible return, or near 0 if rewards have no bound.
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     network = HalfPrecisionMLP if algo.bfloat16 else MLP
@@ -30,13 +30,13 @@ def critic_network(env: EnvBase, algo: OffPolicyConfig) -> TensorDictModule:
 
 
 class CriticPair:
-    """Critics whose parameters a TorchRL loss keeps stacked: one batched product a layer serves both.
+    """Two critics whose parameters a TorchRL loss keeps stacked: one batched product per layer computes both.
 
     TorchRL puts stacked parameters into one module under ``vmap`` before every call, which takes longer than the
     arithmetic of networks as small as ours. The numbers are the same.
 
     Args:
-        critic: module of one critic, an ``MLP`` with ReLU; how it multiplies, this does.
+        critic: module of one critic, an ``MLP`` with ReLU; its precision is used.
         parameters: of both critics, ``(2, ...)`` each, as ``convert_to_functional`` stacks them.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The policy of a finished run: written, and read again."""
+"""Saves and loads the policy of a finished run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def load_policy(folder: Path, env: EnvBase, config: Training) -> TensorDictModul
     Args:
         folder: of the run.
         env: whose observations it reads.
-        config: that the run was started with.
+        config: of the run.
 
     Raises:
         FileNotFoundError: if the run has not finished.

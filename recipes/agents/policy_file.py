@@ -15,7 +15,7 @@ from nht.reading import plain_file, shortened, shown
 from nht.writing import publish, scratch
 
 CHECKSUM = "sha256"
-"""In the header. It stands there alone: safetensors writes several entries in an order that changes."""
+"""Key of the checksum in the header. It is the only entry: safetensors writes several in a varying order."""
 
 
 def write_policy(weights: Mapping[str, Tensor], file: Path) -> None:

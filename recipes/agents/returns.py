@@ -1,4 +1,4 @@
-"""Rewards and what they add up to: their bounds, the price of a failure, targets of several steps."""
+"""Rewards and returns: their bounds, the cost of a failure, and n-step targets."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def return_range(reward_range: Range, gamma: float, steps: float = math.inf) -> 
 @overload
 def return_range(reward_range: Range, gamma: Setting, steps: float = math.inf) -> tuple[Setting, Setting]: ...
 def return_range(reward_range: Range, gamma: Setting, steps: float = math.inf) -> tuple[Setting, Setting]:
-    """The lowest and the highest discounted return that such rewards can add up to, over no step to ``steps``."""
+    """The lowest and the highest discounted return of rewards in this range, over 0 to ``steps`` steps."""
     if isinstance(gamma, Tensor):
         ranges = [return_range(reward_range, each, steps) for each in gamma.tolist()]
         lows, highs = (torch.tensor(ends, device=gamma.device) for ends in zip(*ranges, strict=True))
@@ -44,7 +44,7 @@ def return_range(reward_range: Range, gamma: Setting, steps: float = math.inf) -
 def charge_failure(
     tensordict: TensorDictBase, gamma: Setting, reward_range: Range, steps: float = math.inf
 ) -> TensorDictBase:
-    """Let an episode that failure ended be worth the lowest return, where there is one: failing early never pays."""
+    """Charge the lowest possible return, if there is one, where a failure ends an episode: failing early never pays."""
     if math.isfinite(reward_range[0]):
         lowest, _ = return_range(reward_range, gamma, steps)
         outcome = tensordict["next"]
@@ -54,10 +54,10 @@ def charge_failure(
 
 
 def n_step_returns(gamma: Setting, steps: int) -> Callable[[TensorDictBase], TensorDictBase]:
-    """TorchRL's ``MultiStep``, which turns collected steps ``(*batch, T)`` into ones of up to ``steps`` rewards.
+    """TorchRL's ``MultiStep``, which turns steps ``(*batch, T)`` into transitions with up to ``steps`` rewards.
 
-    Left as it is, it moves observations ahead but not the flags of their ends, and a target that meets a failure would
-    go on to the critic's value of what it led to.
+    On its own it moves observations ahead but not the flags that belong to them, so that a target would add the
+    critic's value even after a failure.
     """
     if isinstance(gamma, Tensor) and steps > 1:  # each learner has its own
         own = [n_step_returns(each, steps) for each in gamma.tolist()]

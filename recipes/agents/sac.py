@@ -28,7 +28,7 @@ from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import Training
 
 LOG_STD = (-10.0, 2.0)
-"""Least and largest logarithm of the deviation, before tanh."""
+"""Smallest and largest logarithm of the standard deviation, before tanh."""
 
 
 @dataclass
@@ -56,7 +56,7 @@ class SAC(Training):
 
 
 class GaussianHead(nn.Module):
-    """Features to mean and deviation of a Gaussian, which tanh turns into actions in [-1, 1]^k.
+    """From features to mean and deviation of a Gaussian, whose samples tanh turns into actions in [-1, 1]^k.
 
     Args:
         network: features ``(*batch, size)`` to ``(*batch, 2 k)``: means, and logarithms of deviations.
@@ -120,9 +120,9 @@ class DirectSACLoss(SACLoss):
         actor_network: as ``tanh_gaussian`` makes it.
         qvalue_network: one critic, an ``MLP`` from features and action to a ``"state_action_value"``.
         gamma: discount factor.
-        target_entropy: which the temperature holds the policy to.
+        target_entropy: the entropy that the temperature keeps the policy at.
         initial_temperature: alpha to start from.
-        draw: standard normal noise of a tensor's shape.
+        draw: returns standard normal noise in the shape of a tensor.
     """
 
     reports: ClassVar[tuple[str, ...]] = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")

@@ -1,4 +1,4 @@
-"""Networks of one shape as one network whose parameters have a leading dimension of learners."""
+"""Stacks networks of one shape into one network whose parameters have a leading dimension of learners."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class StackedLinear(nn.Module):
 
 
 def stacked(networks: Sequence[Network]) -> Network:
-    """One network of the same class for all learners: what reads ``(*batch, size)`` reads ``(L, *batch, size)``.
+    """One network of the same class for all learners: its inputs ``(*batch, size)`` become ``(L, *batch, size)``.
 
     Its linear layers become ``StackedLinear``, every other parameter and buffer gets a leading dimension; names stay,
     so that ``of_learner`` gives the state of one of the networks.

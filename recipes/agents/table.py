@@ -10,18 +10,19 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase
 
 from nht.envs.table import Table, imported
+from nht.reading import shortened
 from nht.recipes.sections import Training
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """What the table knows of an algorithm.
+    """The record of an algorithm.
 
     Attributes:
-        main: where its recipe is, ``"module:function"``; it takes a ``schema``.
-        schema: dataclass of all that the recipe can be told, a ``Training`` with an ``algo`` of its own.
-        policy: makes the untrained policy for an environment and ``algo``, without exploration, whose weights a
-            finished run keeps.
+        main: import path of its recipe, ``"module:function"``, which takes a ``schema``.
+        schema: dataclass of all settings of the recipe, a ``Training`` with an ``algo`` of its own.
+        policy: makes the untrained policy, without exploration, for an environment and ``algo``; a finished run saves
+            its weights.
     """
 
     main: str
@@ -32,8 +33,8 @@ class Algorithm:
         """Run the recipe.
 
         Args:
-            configs: of one learner; of several, where the algorithm trains them together.
-            together: folder of what several learners share.
+            configs: of one learner, or of several if the algorithm can train them together.
+            together: folder for what several learners share.
         """
         more = {} if together is None else {"together": together}
         imported(self.main)(*configs, **more)
@@ -71,11 +72,11 @@ def find_algorithm(name: str) -> Algorithm:
     try:
         return ALGORITHMS[known]
     except (ImportError, TypeError) as error:
-        raise ValueError(f"the algorithm {name!r} cannot be found: {error}") from error
+        raise ValueError(f"the algorithm {name!r} cannot be found: {shortened(error)}.") from error
 
 
 def name_of(schema: type[Training]) -> str:
-    """The name under which the algorithm of a schema stands in the table, or its import path."""
+    """The name of a schema's algorithm in the table, or its import path."""
     for name in ALGORITHMS:
         if ALGORITHMS[name].schema is schema:
             return name

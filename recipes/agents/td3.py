@@ -87,7 +87,7 @@ class DirectTD3Loss(TD3Loss):
         policy_noise: deviation of the noise on the target's action.
         noise_clip: largest absolute value of that noise.
         reward_range: smallest and largest reward of a step, infinite where unknown.
-        draw: standard normal noise of a tensor's shape.
+        draw: returns standard normal noise in the shape of a tensor.
     """
 
     reports: ClassVar[tuple[str, ...]] = ("loss_actor", "loss_qvalue")

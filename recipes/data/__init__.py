@@ -1,1 +1,1 @@
-"""Demonstrations: recording them, and reading those of others."""
+"""Records demonstrations, and reads those of others."""

@@ -1,4 +1,4 @@
-"""What demonstrations look like."""
+"""The figure of demonstrations."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ VIOLIN_ROWS = 5_000  # about as many transitions make the outlines
 GREY = "0.55"
 
 
-def draw(episodes: Episodes, directions: int) -> Figure:
-    """Lengths, returns, energy of the global directions, actuation per motor, and the actuation of some episodes."""
+def draw_figure(episodes: Episodes, directions: int) -> Figure:
+    """Draw lengths, returns, energy of the global directions, actuation per motor, and that of some episodes."""
     data, lengths = episodes.data, lengths_of(episodes.data)
     actuation = data["actuation"]
     colours = _colours(actuation.shape[-1])
@@ -136,7 +136,7 @@ def _clean(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure to a file, and let go of it."""
+    """Write a figure to a file and close it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -18,7 +18,7 @@ from nht.recipes.sections import SourceConfig
 
 
 class Episodes(NamedTuple):
-    """Episodes of a file, laid out as demonstrations; whether their values are finite was not looked at."""
+    """Episodes of a file in the layout of demonstrations; their values are not checked."""
 
     data: TensorDictBase
     left_out: int
@@ -26,14 +26,14 @@ class Episodes(NamedTuple):
     env: str = "unknown"
     expert: str = "unknown"
     notes: dict[str, list[str]] = {}  # noqa: RUF012 - never changed
-    """What else a manifest's settings should say."""
+    """Further entries for the manifest's settings."""
 
 
 def read_episodes(source: SourceConfig) -> Episodes:
     """Read the whole episodes of a file.
 
     Raises:
-        FileNotFoundError: if there is nothing of the kind.
+        FileNotFoundError: if there is no such file or dataset.
         KeyError: for a key that it lacks; the message lists those that are there.
         ValueError: if ``source.path`` is missing, a setting has no meaning for this kind of file, or the file cannot
             be read.
@@ -59,7 +59,7 @@ FILES = {
     "hdf5": "an HDF5 file with observations, actions, rewards, terminals, timeouts",
     "tensordict": "the folder of a memory-mapped TensorDict, such as that of a TorchRL data set",
 }
-"""What ``source.path`` names, by kind of file."""
+"""Meaning of ``source.path`` for each kind of file, for messages."""
 
 
 def _read_minari(source: SourceConfig) -> Episodes:

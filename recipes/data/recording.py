@@ -19,14 +19,14 @@ from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig
 
 COPIES = 100
-FLAGS = ("reward", "success", "terminated", "truncated", "done")
+RECORDED = ("reward", "success", "terminated", "truncated", "done")
 
 Controller = Callable[[TensorDictBase], TensorDictBase]
-"""Writes ``"action"`` into what the environment shows."""
+"""Writes ``"action"`` into the environment's observations."""
 
 
 def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path) -> nht.Demos:
-    """Run the expert until ``demos.transitions`` transitions of good episodes are there, and save them.
+    """Run the expert until there are ``demos.transitions`` transitions of good episodes, and save them.
 
     Episodes end at success. Those that fail or run out of time are left out, and counted in the manifest.
 
@@ -46,24 +46,26 @@ def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Pat
         return current.set("action", torch.from_numpy(expert(observation)).float())
 
     with closing(simulation):
-        data, left_out = record(simulation, simulation.task, act, demos, judged=has_success(env.name))
+        data, left_out = record_episodes(
+            simulation, simulation.task, act, demos, judged=has_success(env.name)
+        )
     manifest = {"options": options, "expert": settings, "left_out_episodes": left_out}
     name = type(expert).__name__
     return nht.save_demos(data, path, env=env.name, seed=seed, expert=name, settings=manifest)
 
 
 def endings(task: str) -> dict[str, bool]:
-    """The options that end a task's episodes at success and at failure, as far as it knows these."""
+    """The options that make a task's episodes end at success and at failure, as far as it has them."""
     return find_task(task).endings if task in TASKS else {}
 
 
 def has_success(task: str) -> bool:
-    """Whether a task has a notion of success: whether its episodes can end there."""
+    """Whether a task has a notion of success, that is, an option to end episodes there."""
     return task in TASKS and find_task(task).has_success
 
 
 @torch.no_grad()
-def record(
+def record_episodes(
     simulation: EnvBase,
     task: BatchedTask,
     act: Controller,
@@ -72,7 +74,7 @@ def record(
     judged: bool,
     actuation_key: NestedKey = "action",
 ) -> tuple[TensorDict, int]:
-    """Run ``act`` until ``demos.transitions`` transitions of good episodes are there.
+    """Run ``act`` until there are ``demos.transitions`` transitions of good episodes.
 
     Args:
         simulation: copies of a task, transformed or not.
@@ -80,7 +82,7 @@ def record(
         act: chooses the actions.
         demos: how many transitions, and the return that a good episode must have.
         judged: whether a good episode must end in success.
-        actuation_key: what the motors got, in the record of a step.
+        actuation_key: key of the executed actuation in the data of a step.
 
     Returns:
         the good episodes, one after the other, and how many others ended.
@@ -115,12 +117,12 @@ def record(
 def _transition(
     stepped: TensorDictBase, keys: list[str], actuation_key: NestedKey, good: torch.Tensor
 ) -> TensorDict:
-    """What is kept of a step, ``(N,)``, and whether it ended a good episode."""
+    """The entries of a step that are kept, ``(N,)``, and whether it ended a good episode."""
     outcome = stepped["next"]
     entries = {
         **{key: stepped[key] for key in keys},
         "actuation": stepped[actuation_key],
-        **{flag: outcome[flag] for flag in FLAGS},
+        **{flag: outcome[flag] for flag in RECORDED},
         "next": {key: outcome[key] for key in keys},
         "good": good,
     }
@@ -130,7 +132,7 @@ def _transition(
 def _good_episodes(steps: TensorDict, transitions: int) -> tuple[TensorDict, int]:
     """From ``(N, T)`` steps the transitions of the good episodes, and the number of others that ended.
 
-    The first to end are taken, no more than it takes to have ``transitions``: copies that started together may all
+    Episodes are taken in the order of their ends until there are ``transitions``: copies that started together may all
     end together.
     """
     done, good = steps["done"].squeeze(-1), steps["good"]

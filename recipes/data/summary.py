@@ -1,4 +1,4 @@
-"""What demonstrations are like, in numbers."""
+"""Statistics of demonstrations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def energy(actuation: torch.Tensor) -> NDArray[np.float64]:
     return np.asarray(eigenvalues.cumsum(0) / eigenvalues.sum().clamp_min(torch.finfo(torch.float64).tiny))
 
 
-def summary(episodes: Episodes, directions: int) -> str:
+def demos_summary(episodes: Episodes, directions: int) -> str:
     """Counts, lengths, returns, success, values that are not finite, and the energy of the first directions."""
     data, lengths = episodes.data, lengths_of(episodes.data)
     bad = sum(int((~value.isfinite()).sum()) for _, value in items(data))

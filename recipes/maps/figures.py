@@ -1,4 +1,4 @@
-"""What a map does, to be looked at: its basis along a demonstration, and where its axes move the tool of an arm."""
+"""Figures of maps: the basis along a demonstration, and how the action axes move the tool of an arm."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ SLOPES = LinearSegmentedColormap.from_list("slopes", ["#1a73e8", "#202020", "#e8
 
 
 def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: int, path: str | Path) -> None:
-    """The bases of maps along a demonstration: beside each other the maps, below each other their columns.
+    """Plot the bases of maps along a demonstration: a column of panels per map, a row per basis vector.
 
-    A panel has a line for each motor; of a long demonstration it shows the first steps. What stands for the basis of
-    a map that is not linear is said at ``local_basis``.
+    A panel has a line for each motor; of a long demonstration it shows the first steps. For a map that is not linear,
+    ``local_basis`` takes the place of the basis.
 
     Args:
         maps: trained maps, by the name to show.
@@ -69,7 +69,7 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
 def tool_figure(
     maps: Mapping[str, nht.ActionMap], demos: nht.Demos, arm: nht.JacobianPinv, axes: int, path: str | Path
 ) -> None:
-    """Where each action axis moves the tool, seen from above: beside each other the maps, below each other the axes.
+    """Plot how each action axis moves the tool, seen from above: a column of panels per map, a row per axis.
 
     Dots are demonstrated positions of the tool, those nearest to a grid; an arrow from each is the tool's velocity
     for an action on that axis, drawn to one scale for all axes of a map. The colour is the vertical share of the
@@ -113,7 +113,7 @@ def tool_figure(
 
 @torch.no_grad()
 def local_basis(map: nht.ActionMap, context: Tensor, actuation: Tensor) -> Tensor:
-    """Q(c); of a map that is not linear, the derivative of the actuation at the projected demonstrated action.
+    """Q(c); for a map that is not linear, the derivative of the actuation at the projected demonstrated action.
 
     Args:
         map: any map.
@@ -130,7 +130,7 @@ def local_basis(map: nht.ActionMap, context: Tensor, actuation: Tensor) -> Tenso
 
 @torch.no_grad()
 def axis_motion(map: nht.ActionMap, context: Tensor) -> Tensor:
-    """The actuation that an action of ``action_scale`` on each axis adds to that of no action.
+    """The change of the actuation from action 0 to an action of ``action_scale`` on each axis.
 
     Args:
         map: any map.
@@ -145,7 +145,7 @@ def axis_motion(map: nht.ActionMap, context: Tensor) -> Tensor:
 
 
 def near_grid(points: Tensor) -> Tensor:
-    """Of points (T, 2), the rows of those that are nearest to the nodes of a grid over them, where any are near."""
+    """Indices of the points (T, 2) that are nearest to the nodes of a grid over them, where any are near."""
     low, high = points.amin(0), points.amax(0)
     step = (high - low).max().clamp_min(1e-9) / GRID
     counts = ((high - low) / step).round().int().clamp_min(1).tolist()

@@ -22,7 +22,7 @@ from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig, Training
 from nht.storage import format_version
 
 
-def train_map(
+def trained_map(
     map: MapConfig,
     env: EnvConfig,
     demos: DemosConfig,
@@ -31,7 +31,7 @@ def train_map(
     *,
     align: str | None = None,
 ) -> nht.MapTraining:
-    """Train the map that ``map`` describes; without a folder of demonstrations the expert gives them.
+    """Train the map that ``map`` describes; without a folder of demonstrations, the expert records some.
 
     With ``align="tool"`` its axes are then turned to the motion of the arm's tool: 1 is along +x, 2 along +y, 3 along
     +z, on average over the demonstrations; 4, 5 and 6 turn it about x, y and z.
@@ -94,7 +94,7 @@ def _tool_aligned(map: nht.ActionMap, demos: nht.Demos, task: str) -> nht.Action
 
 
 def _configured(map: nht.ActionMap, settings: MapConfig) -> nht.ActionMap:
-    """A map with the corrections and the action scale that are asked for: from here on they are its own."""
+    """The map with the corrections and the action scale of the settings, which are part of it from here on."""
     if settings.residual is not None and not isinstance(map, nht.Residual):
         map = nht.Residual(map, settings.residual)
     if settings.saturation is not None:
@@ -104,15 +104,15 @@ def _configured(map: nht.ActionMap, settings: MapConfig) -> nht.ActionMap:
     return map
 
 
-def load_kind(settings: MapConfig) -> nht.ActionMap:
-    """The map in ``map.file``, which must be of ``map.kind``; with corrections, if asked for, that it may not have.
+def map_from_file(settings: MapConfig) -> nht.ActionMap:
+    """The map in ``map.file``, which must be of ``map.kind``; corrections are added if asked for.
 
-    What an action means is the file's: ``map.action_scale`` changes it only where it is set. Files of the first
-    format version were used at the kind's own scale, and are.
+    The file's action scale holds unless ``map.action_scale`` is set. Files of format version 1 get the default scale of
+    the kind, as before.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is of another kind or has other corrections, for a run would carry the wrong name.
+        ValueError: if it is of another kind or has other corrections, as the run's name would be wrong.
     """
     path, kind = settings.file or "", find_kind(settings.kind)
     map = nht.load_map(path, allow=settings.allow)
@@ -137,7 +137,7 @@ def load_kind(settings: MapConfig) -> nht.ActionMap:
 def run_map(settings: Training, motors: int) -> nht.MapTraining:
     """The map that a run is told to use: the given file's, one trained on demonstrations, or the motors themselves.
 
-    What its training gave comes with it, nothing if there was none. Raw actuation of a given scale needs no
+    The result has the metrics of its training, if there was one. Raw actuation of a given scale needs no
     demonstrations.
 
     Args:
@@ -150,7 +150,7 @@ def run_map(settings: Training, motors: int) -> nht.MapTraining:
     """
     map, env = settings.map, settings.env
     if map.file is not None:
-        loaded = load_kind(map)
+        loaded = map_from_file(map)
         said = find_kind(map.kind).context_keys or env.context_keys
         own = loaded.context_keys if loaded.context_dim else None
         if said is not None and own is not None and list(own) != list(said):
@@ -160,11 +160,11 @@ def run_map(settings: Training, motors: int) -> nht.MapTraining:
         return nht.MapTraining(loaded, {})
     if map.kind == "none" and map.residual is None and default_scale(map) is not None:
         return nht.MapTraining(_configured(nht.Identity(motors), map), {})
-    return train_map(map, env, settings.demos, settings.seed)
+    return trained_map(map, env, settings.demos, settings.seed)
 
 
 def number_of_actions(settings: Training, motors: int, context_dim: int) -> int:
-    """How many actions the map has that a run is told to use, before it is trained.
+    """The number of actions k of the map that a run will use, before it is trained.
 
     Args:
         settings: of the run.
@@ -177,6 +177,6 @@ def number_of_actions(settings: Training, motors: int, context_dim: int) -> int:
     """
     map = settings.map
     if map.file is not None:
-        return load_kind(map).action_dim
+        return map_from_file(map).action_dim
     width = make_map(map, context_dim, motors, settings.seed, settings.env).action_dim
     return width if map.residual is None else width + motors

@@ -11,30 +11,31 @@ import nht
 from nht.envs import TASKS, Arm
 from nht.envs.registry import TaskRecord, find_task
 from nht.envs.table import Table
+from nht.reading import shortened
 from nht.recipes.sections import DEFAULT_SCALE, EnvConfig, MapConfig
 
 NETWORK_SETTINGS = ("hidden", "activation", "multi_head", "start", "lipschitz", "beta_kl", "beta_dynamics")
-"""Settings of ``map`` that shape networks: a kind without one passes over them."""
+"""Settings of ``map`` that shape networks: a kind without a network ignores them."""
 SETTINGS = (*NETWORK_SETTINGS, "offset")
-"""Settings of ``map`` that are handed to a kind's constructor if it takes arguments of these names."""
+"""Settings of ``map`` that are passed to a kind's constructor if it takes arguments of these names."""
 
 
 @dataclass(frozen=True)
 class MapKind:
-    """What the table knows of a kind of map.
+    """The record of a kind of map.
 
     Attributes:
         map_class: its class.
         build: makes an untrained one; the class itself by default. It gets what its signature asks for by name, out of
             ``context_dim``, ``actuation_dim``, ``action_dim``, ``seed``, ``arm`` (an ``Arm``), the settings of
             ``map`` that shape networks, and ``map.args``.
-        action_scale: what an action of 1 is worth unless told otherwise; None is the demonstrations' largest action,
-            for kinds whose actions have units of their own.
+        action_scale: default of what an action of 1 stands for; None is the demonstrations' largest action, for kinds
+            whose actions have units of their own.
         context_keys: the observations that it needs, whatever the task says; None leaves that to the task.
         needs_arm: whether the task must be done by a known arm.
-        needs_demos: whether demonstrations decide what it does.
+        needs_demos: whether it must be trained on demonstrations.
         fixed_width: whether its number of actions is not ``map.action_dim`` but its own.
-        colour: in figures; None takes one by its name.
+        colour: in figures; None derives one from its name.
     """
 
     map_class: type[nht.ActionMap]
@@ -105,10 +106,10 @@ def find_kind(name: str) -> MapKind:
     try:
         return KINDS[name]
     except (ImportError, TypeError) as error:
-        raise ValueError(f"the map kind {name!r} cannot be found: {error}") from error
+        raise ValueError(f"the map kind {name!r} cannot be found: {shortened(error)}.") from error
 
 
-def file_name(kind: str) -> str:
+def kind_in_file_name(kind: str) -> str:
     """A kind's name as part of a file's."""
     return kind.replace(":", ".")
 
@@ -127,18 +128,18 @@ def task_context_keys(env: EnvConfig) -> list[str]:
 
 
 def map_context_keys(map: MapConfig, env: EnvConfig) -> list[str]:
-    """The observations that a map of a kind sees in a task: those that the kind needs, or else the task's."""
+    """The observations that this map sees in a task: those that its kind needs, or else the task's."""
     needed = find_kind(map.kind).context_keys
     return list(needed) if needed is not None else task_context_keys(env)
 
 
 def default_scale(map: MapConfig) -> float | None:
-    """What ``map.action_scale`` asks for: a number, or None for the demonstrations' largest action."""
+    """The action scale of the configuration: a number, or None for the demonstrations' largest action."""
     return find_kind(map.kind).action_scale if map.action_scale == DEFAULT_SCALE else map.action_scale
 
 
 def arm_of(task: str) -> nht.JacobianPinv:
-    """How the joints of a task's arm move its tool.
+    """The Jacobian map of a task's arm.
 
     Raises:
         ValueError: if the task has no known arm; the message lists those that have one.
@@ -191,19 +192,19 @@ def make_map(
         return build(**arguments)
     except TypeError as error:
         raise ValueError(
-            f"map.kind {map.kind!r} cannot be built from {sorted(arguments)}: {error}."
+            f"map.kind {map.kind!r} cannot be built from {sorted(arguments)}: {shortened(error)}."
         ) from error
 
 
 def _unlimited_gain(build: Callable[..., nht.ActionMap], arguments: dict[str, Any]) -> float:
-    """From the network's output to the basis."""
+    """The Lipschitz constant from the network's output to the basis."""
     map = build(**arguments | {"lipschitz": None})
     assert isinstance(map, nht.LinearActionMap)
     return map.network_gain
 
 
 def _check_options(map: MapConfig, taken: list[str]) -> None:
-    """A kind without a network passes over what shapes networks; any other kind must have what is asked for."""
+    """Raise for options that the kind does not have; a kind without a network ignores those that shape networks."""
     if unknown := sorted(map.args.keys() - taken):
         raise ValueError(f"map.args {unknown} are not arguments of {map.kind!r}, which takes {taken}.")
     asked = SETTINGS if "hidden" in taken else SETTINGS[len(NETWORK_SETTINGS) :]

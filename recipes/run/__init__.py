@@ -1,1 +1,1 @@
-"""What a run of any algorithm has around its loop."""
+"""The parts of a run that do not depend on the algorithm."""

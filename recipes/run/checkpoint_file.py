@@ -1,4 +1,4 @@
-"""The file of a checkpoint: state dictionaries in one archive in TorchRL's layout, read without pickle.
+"""Reads the file of a checkpoint without pickle: state dictionaries in one archive in TorchRL's layout.
 
 An archive is a ZIP file of members that are stored, not compressed. For each part it has ``state.json``, which says how
 dictionaries, lists and numbers are nested, and a raw file for each tensor with a ``meta.json`` beside them; and
@@ -17,13 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nht.memmap_files import DTYPES, META, PLAIN, STORAGE, file_name, raw
+from nht.memmap_files import DTYPES, META, STORAGE, TENSORDICT_TYPE, file_name, raw
 from nht.reading import MAX_TEXT, checksum, entry, parse_json, plain_file, shortened
-from nht.recipes.run.state_json import decoded
+from nht.recipes.run.state_json import from_json
 
 FORMAT, FORMAT_VERSION = "torchrl.checkpoint", 1
-MANIFEST = "manifest.json"
-CHUNK = 2**24
+CHECKPOINT_MANIFEST = "manifest.json"
+CHUNK_BYTES = 2**24
 DAMAGED = (
     zipfile.BadZipFile,
     OSError,
@@ -66,7 +66,7 @@ class CheckpointFile:
         self._archive.close()
 
     def _checked_members(self) -> dict[str, zipfile.ZipInfo]:
-        """By name; each once, stored as it is, and all together no larger than the file."""
+        """The members by name, after checking that each is there once, uncompressed, and all fit into the file."""
         members = {info.filename: info for info in self._archive.infolist()}
         if len(members) < len(self._archive.infolist()):
             raise ValueError("two members have the same name.")
@@ -80,8 +80,8 @@ class CheckpointFile:
         return members
 
     def _read_manifest(self) -> dict[str, Any]:
-        where = f"{self.file}, {MANIFEST}"
-        manifest = self._json(MANIFEST)
+        where = f"{self.file}, {CHECKPOINT_MANIFEST}"
+        manifest = self._json(CHECKPOINT_MANIFEST)
         if manifest.get("format") != FORMAT:
             raise ValueError(f"{where} is not marked {FORMAT!r}.")
         if entry(manifest, "format_version", int, where) != FORMAT_VERSION:
@@ -101,9 +101,9 @@ class CheckpointFile:
         return manifest
 
     def check(self) -> None:
-        """Raise ValueError unless every byte is what was written."""
-        if self._sums and self._sums.keys() != self._members.keys() - {MANIFEST}:
-            raise ValueError(f"{self.file} has other members than its {MANIFEST} says.")
+        """Raise ValueError unless all members have their checksums."""
+        if self._sums and self._sums.keys() != self._members.keys() - {CHECKPOINT_MANIFEST}:
+            raise ValueError(f"{self.file} has other members than its {CHECKPOINT_MANIFEST} says.")
         for name in self._members:
             self._read(name)
 
@@ -128,7 +128,7 @@ class CheckpointFile:
             for key, entry_ in about.items()
             if isinstance(entry_, dict)
         }
-        return decoded(self._json(f"{folder}/state.json"), tensors, where)
+        return from_json(self._json(f"{folder}/state.json"), tensors, where)
 
     def _tensor(self, name: str, about: dict[str, Any], where: str) -> Tensor:
         kind, shape = entry(about, "dtype", str, where), entry(about, "shape", list, where)
@@ -147,7 +147,7 @@ class CheckpointFile:
         return tensor
 
     def _dumped_buffer(self, folder: str) -> dict[str, Any]:
-        """A replay buffer as TorchRL's ``dump`` left it, less what it pickles: a queue that is empty here."""
+        """A replay buffer from TorchRL's ``dump``, without what that pickles: a queue that is empty here."""
         where = f"{self.file}, {folder}"
         storage = self._json(f"{folder}/storage/{STORAGE}")
         if entry(storage, "is_pytree", bool, where):
@@ -158,9 +158,9 @@ class CheckpointFile:
         return {"rows": rows, "writer": {f"_{name}": entry(writer, name, int, where) for name in names}}
 
     def _rows(self, folder: str, length: int) -> dict[str, Any]:
-        """The first rows of a TensorDict as it lays itself out in raw files."""
+        """The first rows of a TensorDict that is stored in raw files."""
         about = self._json(f"{folder}/{META}")
-        if about.get("_type") != PLAIN:
+        if about.get("_type") != TENSORDICT_TYPE:
             raise ValueError(f"{self.file}, {folder}/{META} is of another type than TensorDict.")
         rows: dict[str, Any] = {}
         for key, record in about.items():
@@ -194,11 +194,11 @@ class CheckpointFile:
         return parse_json(bytes(content), f"{self.file}, {name}")
 
     def _read(self, name: str, into: memoryview | None = None) -> None:
-        """Read all of a member, compare its checksums, and put it where it is wanted."""
+        """Read all of a member, into ``into`` if given, and compare its checksums."""
         digest, done = hashlib.sha256(), 0
         try:
             with self._archive.open(self._member(name)) as member:
-                while chunk := member.read(CHUNK):
+                while chunk := member.read(CHUNK_BYTES):
                     digest.update(chunk)
                     if into is not None:
                         into[done : done + len(chunk)] = chunk
@@ -207,7 +207,7 @@ class CheckpointFile:
             raise ValueError(
                 f"{self.file}, {shortened(name, 120)} is damaged: {shortened(error)}."
             ) from error
-        if self._sums and name != MANIFEST and self._sums.get(name) != digest.hexdigest():
+        if self._sums and name != CHECKPOINT_MANIFEST and self._sums.get(name) != digest.hexdigest():
             raise ValueError(
                 f"{self.file}, {name} was changed since it was written: its checksum is another."
             )

@@ -1,4 +1,4 @@
-"""Writing the file of a checkpoint, as ``checkpoint_file`` describes and reads it."""
+"""Writes the file of a checkpoint, which ``checkpoint_file`` describes and reads."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from nht.memmap_files import PLAIN, raw
+from nht.memmap_files import TENSORDICT_TYPE, raw
 from nht.reading import checksum
-from nht.recipes.run.checkpoint_file import CHUNK, FORMAT, FORMAT_VERSION, MANIFEST
-from nht.recipes.run.state_json import encoded
+from nht.recipes.run.checkpoint_file import CHECKPOINT_MANIFEST, CHUNK_BYTES, FORMAT, FORMAT_VERSION
+from nht.recipes.run.state_json import as_json
 
 
 def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
     """Write state dictionaries to a new file.
 
     Args:
-        file: not there yet.
+        file: path of a file that does not exist yet.
         parts: by name, dictionaries of tensors, arrays, numbers, text, lists, tuples and dictionaries.
 
     Raises:
@@ -39,10 +39,10 @@ def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
             folder = f"components/{number:04d}-{name}"
             tensors: dict[str, Tensor] = {}
             files: dict[str, bytes | Tensor] = {
-                "state.json": json.dumps(encoded(state, tensors), separators=(",", ":")).encode()
+                "state.json": json.dumps(as_json(state, tensors), separators=(",", ":")).encode()
             }
             about: dict[str, Any] = {key: _about(value) for key, value in tensors.items()}
-            about |= {"shape": [], "device": "cpu", "_type": PLAIN}
+            about |= {"shape": [], "device": "cpu", "_type": TENSORDICT_TYPE}
             files["state/meta.json"] = json.dumps(about, separators=(",", ":")).encode()
             files |= {f"state/{key}.memmap": value for key, value in tensors.items() if value.numel()}
             for inner, content in files.items():
@@ -64,7 +64,11 @@ def write_checkpoint(file: Path, parts: Mapping[str, Any]) -> None:
             "components": records,
             "sha256": sums,
         }
-        _write(archive, MANIFEST, json.dumps(manifest | {"checksum": checksum(manifest)}, indent=2).encode())
+        _write(
+            archive,
+            CHECKPOINT_MANIFEST,
+            json.dumps(manifest | {"checksum": checksum(manifest)}, indent=2).encode(),
+        )
 
 
 def size_of(state: Any) -> int:
@@ -83,11 +87,11 @@ def _about(value: Tensor) -> dict[str, Any]:
 
 
 def _write(archive: zipfile.ZipFile, name: str, content: bytes | Tensor) -> str:
-    """Write a member; its SHA-256."""
+    """Write a member and return its SHA-256."""
     view = raw(content) if isinstance(content, Tensor) else memoryview(content)
     digest = hashlib.sha256()
     with archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as member:
-        for start in range(0, len(view), CHUNK):
-            digest.update(view[start : start + CHUNK])
-            member.write(view[start : start + CHUNK])
+        for start in range(0, len(view), CHUNK_BYTES):
+            digest.update(view[start : start + CHUNK_BYTES])
+            member.write(view[start : start + CHUNK_BYTES])
     return digest.hexdigest()

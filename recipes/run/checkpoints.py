@@ -19,7 +19,7 @@ from nht.recipes.run.checkpoint_writing import size_of, write_checkpoint
 from nht.writing import check_room, publish, remove_leftovers, scratch
 
 NAME = re.compile(r"checkpoint-(\d{1,18})\.torchrl")
-"""Of a checkpoint, with the number of steps; other files are passed over."""
+"""File name of a checkpoint, with the number of steps; other files are ignored."""
 
 KEPT = 2
 
@@ -29,9 +29,9 @@ class Checkpoints:
 
     Args:
         folder: where they are.
-        parts: what a run goes on from, each with a ``state_dict`` and a ``load_state_dict``, or a replay buffer; the
+        parts: what is saved, by name: objects with ``state_dict`` and ``load_state_dict``, or replay buffers; the
             generators of torch, NumPy and Python are added.
-        learners: whose networks are stacked, if several: one that is lost does not keep the others from going on.
+        learners: number of learners whose networks are stacked, if several: if some diverged, the others still resume.
     """
 
     def __init__(self, folder: Path, *, learners: int | None = None, **parts: Any) -> None:
@@ -55,13 +55,13 @@ class Checkpoints:
                 write_checkpoint(place, states)
                 publish(place, path)
         except OSError as error:
-            reason = f"no checkpoint after {frames} steps: {error.strerror or error}"
+            reason = f"no checkpoint after {frames} steps: {shortened(error.strerror or error)}"
             latest = max(self._found().items(), default=(0, None))[1]
-            raise OSError(error.errno, f"{reason}. The last one is {latest}") from error
+            raise OSError(error.errno, f"{reason}. The last one is {latest}.") from error
         self._prune(frames)
 
     def _prune(self, frames: int) -> None:
-        """Keep the last ones up to now; any that say more steps are of a way that was given up."""
+        """Keep the last checkpoints up to now; those of more steps belong to a run that was rewound."""
         found = self._found()
         kept = sorted(step for step in found if step <= frames)[-KEPT:]
         for step in found.keys() - set(kept):
@@ -73,9 +73,9 @@ class Checkpoints:
         return {int(match[1]): path for path, match in names.items() if match is not None}
 
     def steps(self) -> list[int]:
-        """The steps after which checkpoints were written that can be read, oldest first.
+        """The steps of all readable checkpoints, oldest first.
 
-        Others are passed over with a warning, and what a kill in the middle of writing left behind is removed.
+        Unreadable ones are ignored with a warning, and leftovers of interrupted writing are removed.
 
         Raises:
             ValueError: if there are checkpoints, but none that can be read.
@@ -116,16 +116,16 @@ class Checkpoints:
 
 
 def check_finite(saved: Any, own: dict[str, Any], where: str, learners: int | None = None) -> None:
-    """Check that the numbers of a network are finite, those aside that are the same in the network as it is built.
+    """Check that a network's numbers are finite; those that are not finite in the network as built may stay so.
 
     Args:
         saved: the network's state.
         own: that of the network as it is built.
-        where: they come from, for the message.
-        learners: whose networks are stacked in it, if several: then some of them may be lost, but not all.
+        where: the source of the numbers, for the message.
+        learners: number of learners whose networks are stacked in it, if several: then some may have diverged, not all.
 
     Raises:
-        ValueError: if there are others.
+        ValueError: if other numbers are not finite.
     """
     lost = torch.zeros(learners or 1, dtype=torch.bool)
     for name, value in saved.items() if isinstance(saved, dict) else ():
@@ -144,22 +144,22 @@ def check_finite(saved: Any, own: dict[str, Any], where: str, learners: int | No
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether all of an archive is what was written; says so if not."""
+    """Whether a checkpoint is intact; warns if not."""
     try:
         with CheckpointFile(path) as file:
             file.check()
     except (ValueError, OSError) as error:
-        warnings.warn(f"{path} cannot be read and is passed over: {error}", stacklevel=3)
+        warnings.warn(f"{path} cannot be read and is passed over: {shortened(error)}.", stacklevel=3)
         return False
     return True
 
 
 class BufferState:
-    """What a replay buffer holds, as a state dictionary: its rows as far as it is filled, and where it writes next.
+    """The contents of a replay buffer as a state dictionary: its filled rows, and where it writes next.
 
     Args:
         buffer: of rows ``()``.
-        learners: a step of each of whom a row is, ``(learners,)``, if there are several.
+        learners: number of learners, if there are several; a row then holds a step of each, ``(learners,)``.
     """
 
     def __init__(self, buffer: ReplayBuffer, learners: int | None = None) -> None:
@@ -177,7 +177,7 @@ class BufferState:
         }
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
-        """Hold the rows of ``saved``.
+        """Replace the contents by the rows of ``saved``.
 
         Raises:
             ValueError: if there are more than the buffer has room for.

@@ -1,4 +1,4 @@
-"""``config.yaml`` of a run, read as plain settings: nothing that it names is imported or looked up elsewhere."""
+"""Reads ``config.yaml`` of a run as plain settings: nothing that it names is imported or looked up."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import yaml
 from nht.reading import read_text, shortened
 
 MOST = 20_000
-"""Values in a configuration, counted as often as aliases repeat them."""
+"""Largest number of values in a configuration, counted as often as YAML aliases repeat them."""
 
 NAMES = (("recipe",), ("env", "name"), ("env", "suite"), ("map", "kind"))
 """Settings that may be import paths, ``package.module:Name``."""
@@ -22,7 +22,7 @@ def read_settings(file: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no YAML, holds other things, or grows beyond bounds; says where.
+        ValueError: if it is no YAML, has values of other types, or too many; says where.
     """
     text = read_text(file)
     try:

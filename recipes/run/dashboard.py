@@ -1,6 +1,6 @@
-"""A run on Weights and Biases: offline unless the user has logged in, and never needed for a run to work.
+"""Logs a run to Weights & Biases: offline unless the user has logged in, and never required.
 
-``wandb`` is imported where a run wants it, and nowhere else.
+``wandb`` is imported only if a run uses it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from nht.recipes.run.metrics import FRAMES
 from nht.recipes.sections import RunConfig
 
 LONGEST_NAME = 128
-"""Characters in the name of an artifact."""
+"""Largest number of characters in the name of an artifact."""
 SERVER = "https://api.wandb.ai"
-"""W&B's own, unless ``WANDB_BASE_URL`` names another."""
+"""W&B's own server, unless ``WANDB_BASE_URL`` names another."""
 
 
 class Dashboard:
@@ -29,8 +29,8 @@ class Dashboard:
 
     Args:
         folder: of the run.
-        settings: what is in its ``config.yaml``; every key of it is found again in W&B.
-        run: where it stands there.
+        settings: of its ``config.yaml``; W&B shows them under the same keys.
+        run: names of the project, group and so on in W&B.
         mode: ``online``, ``offline`` or ``shared``.
 
     Raises:
@@ -61,11 +61,11 @@ class Dashboard:
             ) from error
 
     def log(self, frames: int, row: dict[str, float]) -> None:
-        """A row of metrics, against environment steps."""
+        """Log a row of metrics against environment steps."""
         self._run.log(row | {FRAMES: frames}, step=frames)
 
     def finish(self, map_file: Path, video: Path) -> None:
-        """Hand over the map, and the video if there is one."""
+        """Upload the map, and the video if there is one."""
         if video.exists():
             self._run.log({"video": self._wandb.Video(str(video), format="mp4")})
         name = re.sub(r"[^A-Za-z0-9_.-]", "-", f"map-{self._folder.name}")  # what W&B allows
@@ -75,7 +75,7 @@ class Dashboard:
         self._run.finish()
 
     def leave(self) -> None:
-        """Note that the run stopped before its end: a process that goes on to others must not keep it open."""
+        """Close a run that stopped before its end: a process may go on to other runs."""
         self._run.finish(exit_code=1)
 
 
@@ -88,7 +88,7 @@ def open_dashboard(folder: Path, settings: Mapping[str, Any], run: RunConfig) ->
 
 
 def wanted(run: RunConfig) -> bool:
-    """Whether a run is to be written for W&B: not with ``run.wandb=false``, nor with ``WANDB_MODE=disabled``.
+    """Whether a run is logged to W&B: not with ``run.wandb=false``, nor with ``WANDB_MODE=disabled``.
 
     Raises:
         ImportError: if it is, and ``wandb`` is not installed.

@@ -32,11 +32,11 @@ from nht.writing import replacing
 
 METRICS_FILE, WHOLE_FILE, VIDEO_FILE = "metrics.csv", "whole.json", "video.mp4"
 MAP_METRICS_FILE = "map.json"
-"""What the training of the run's map gave, if it trained one."""
+"""File with the metrics of the map's training, if the run trained its map."""
 
 
 class RunFolder:
-    """Where one run writes: ``metrics.csv`` has a row per evaluation, W&B gets the same numbers.
+    """The folder that one run writes to: ``metrics.csv`` has a row per evaluation, W&B gets the same numbers.
 
     The first of the processes that learn together opens and writes it; the others wait and read.
 
@@ -45,17 +45,17 @@ class RunFolder:
         ranks: the processes that learn together.
 
     Raises:
-        FileExistsError: if ``run.resume`` is false and the folder holds a run already, unless it is this very run and
-            whole; or if another process owns it.
+        FileExistsError: if ``run.resume`` is false and the folder holds another run or an unfinished one; or if another
+            process owns it.
         FileNotFoundError: if ``run.resume`` is true and there is nothing to resume.
-        ValueError: if the run that is to go on has other settings, or the task or map cannot be made as told. Nothing
-            is left behind then.
+        ValueError: if the run to resume has other settings, or the task or map cannot be made. Nothing is left behind
+            then.
 
     Attributes:
         path: of the folder.
         config: the configuration, with what follows from task and map filled in.
-        resuming: whether it holds a run already, which is to go on.
-        map: the run's action map; it says what an action means.
+        resuming: whether the folder holds a run that is resumed.
+        map: the run's action map.
     """
 
     def __init__(self, config: Training, ranks: Ranks) -> None:
@@ -81,7 +81,7 @@ class RunFolder:
         self.map = kept_map(self.path, read_config(self.path, self._named()), ranks.device)
 
     def _named(self) -> list[str]:
-        """Modules that the command line names by import paths, and that the folder therefore may name."""
+        """Modules that the command line names in import paths; the folder's files may name them, too."""
         config = self.config
         names = [name_of(type(config)), config.env.name, config.env.suite, config.map.kind]
         return [name.partition(":")[0] for name in names if ":" in name]
@@ -114,7 +114,7 @@ class RunFolder:
         self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
 
     def _look(self) -> None:
-        """Find out whether a run is to go on here, and whether it may."""
+        """Find out whether there is a run to resume, and whether it may be resumed."""
         settings, run = self.path / CONFIG_FILE, self.config.run
         resume = run.resume or ("auto" if self._ranks.restarts else False)  # torchrun starts processes anew
         self.resuming = settings.exists()
@@ -134,7 +134,7 @@ class RunFolder:
                 raise
 
     def _settings(self) -> dict[str, Any]:
-        """What ``config.yaml`` holds."""
+        """The contents of ``config.yaml``."""
         return {"recipe": name_of(type(self.config)), **asdict(self.config)}
 
     def _write_config(self) -> None:
@@ -143,7 +143,7 @@ class RunFolder:
 
     @property
     def whole(self) -> bool:
-        """Whether the run got to its end, with everything that belongs to it, and has nothing left to do."""
+        """Whether the run is complete: trained to its end, with all its files written."""
         try:
             ended = json.loads((self.path / WHOLE_FILE).read_text())
             return bool(ended[FRAMES] >= self.config.algo.total_frames)
@@ -152,7 +152,7 @@ class RunFolder:
 
     @property
     def members(self) -> list[RunFolder]:
-        """The folders of all learners: this one."""
+        """The folders of all learners: only this one."""
         return [self]
 
     @property
@@ -173,7 +173,7 @@ class RunFolder:
         """Append the row of the only learner.
 
         Raises:
-            FloatingPointError: if that is what there is in its place.
+            FloatingPointError: if an error is given in place of the row.
         """
         (row,) = rows
         if isinstance(row, FloatingPointError):
@@ -195,9 +195,9 @@ class RunFolder:
             self._dashboard.log(frames, row)
 
     def rewind(self, frames: int) -> None:
-        """Drop the rows behind ``frames``, or cut short by a kill: a resumed run writes them again.
+        """Drop rows after ``frames``, and rows that a kill cut short: a resumed run writes them again.
 
-        Its clock goes on from the last row that stays. Raises ValueError if the file holds anything else.
+        The clock goes on from the last row that is kept. Raises ValueError if the file is no table of metrics.
         """
         if not self._ranks.first or not self.metrics.exists():
             return
@@ -211,7 +211,7 @@ class RunFolder:
             csv.writer(file).writerows([heading, *kept])
 
     def finish(self, frames: int) -> None:
-        """Hand video and map to W&B, and note that the run is whole."""
+        """Upload video and map to W&B, and mark the run as complete."""
         if not self._ranks.first:
             return
         if self._dashboard is not None:
@@ -221,7 +221,7 @@ class RunFolder:
             scratch.write_text(json.dumps({FRAMES: frames}))
 
     def show(self) -> None:
-        """Say what happened and where the files are."""
+        """Print the outcome and where the files are."""
         if not self._ranks.first:
             return
         rows = pandas.read_csv(self.metrics)
@@ -230,7 +230,7 @@ class RunFolder:
         print(f"\n{self.path}: " + ", ".join(shown))
 
     def close(self) -> None:
-        """Let go of the folder, and of W&B's run if it did not get to its end."""
+        """Release the folder, and close W&B's run if it is incomplete."""
         if self._dashboard is not None:
             self._dashboard.leave()
             self._dashboard = None
@@ -238,7 +238,7 @@ class RunFolder:
 
 
 def resolved(config: Training) -> Training:
-    """The configuration with what follows from task and kind of map filled in: it stands in the run's files."""
+    """The configuration with the defaults of task and kind of map filled in, as the run's files have it."""
     env = replace(config.env, context_keys=map_context_keys(config.map, config.env))
     map = replace(config.map, action_scale=default_scale(config.map))
     if config.map.file is not None:  # the file says

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 FRAMES, UPDATES, SECONDS = "frames", "updates", "seconds"
 SUCCESS, FAILURE, RETURN = "success", "failure", "return"
-OUTCOMES = (SUCCESS, FAILURE, RETURN)
-"""What an episode is judged by."""
+EPISODE_OUTCOMES = (SUCCESS, FAILURE, RETURN)
+"""The outcomes of an episode."""
 DIVERGED, CLIPPED = "diverged", "clipped"
 
 
@@ -19,13 +19,13 @@ def trained(outcome: str) -> str:
     return f"train_{outcome}"
 
 
-TESTED = tuple(map(tested, OUTCOMES))
+TESTED = tuple(map(tested, EPISODE_OUTCOMES))
 EVERY_RUN = (FRAMES, *TESTED, SECONDS)
 """Columns that every run has, whatever the algorithm."""
 
 
 def check_outcome(name: str, given: str) -> None:
-    """Raise ValueError unless an outcome is one that runs are compared by.
+    """Raise ValueError unless runs can be compared by the outcome.
 
     Args:
         name: of the setting.

@@ -1,4 +1,4 @@
-"""``metrics.csv`` of a run, read and checked: a row for each evaluation, its steps growing."""
+"""Reads and checks ``metrics.csv`` of a run: a row for each evaluation, with growing numbers of steps."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from nht.recipes.run.metrics import FRAMES, SECONDS
 
 
 def read_metrics(file: Path) -> tuple[list[str], list[list[str]]]:
-    """The heading, and the rows as they are written; a row that a kill cut short is left out.
+    """The heading and the rows as text; a row that a kill cut short is left out.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no table of metrics: another heading, or values that are no numbers; says in which line.
+        ValueError: if it is no table of metrics: it has another heading, or a value that is no number; says in which
+            line.
     """
     try:
         lines = list(csv.reader(io.StringIO(read_text(file), newline=""), strict=True))
@@ -42,7 +43,7 @@ def read_metrics(file: Path) -> tuple[list[str], list[list[str]]]:
 
 
 def metrics_table(file: Path) -> pandas.DataFrame:
-    """The same as numbers, a column for each name of the heading."""
+    """The table of metrics as numbers, a column for each name of the heading."""
     heading, rows = read_metrics(file)
     table = pandas.DataFrame(rows, columns=heading or [FRAMES]).astype(float)
     return table.astype({FRAMES: int})

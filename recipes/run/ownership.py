@@ -1,6 +1,6 @@
-"""One owner at a time, of a run's folder or of a job: a file that its owner holds locked.
+"""Gives a run's folder or a job one owner at a time: the owner holds a file locked.
 
-The lock is the operating system's: it goes with the process that has it, however that ends, and no clock is asked.
+The lock is the operating system's: it ends with the process that holds it, however that ends, and depends on no clock.
 It also holds between machines that share a file system with locks (NFS, Lustre, Ceph).
 """
 
@@ -17,14 +17,14 @@ from typing import IO
 
 
 class OwnedError(FileExistsError):
-    """Another process owns what this one was to write."""
+    """Another process owns the folder or job that this one was to write."""
 
 
 @contextlib.contextmanager
 def claimed(file: Path) -> Iterator[bool]:
-    """Whether this process owns what ``file`` stands for: nobody else does, here or where the folder is shared.
+    """Claim what ``file`` stands for; True if this process owns it within, False if another one does, on any machine.
 
-    While it does, the file says which process it is; afterwards the file is gone.
+    While this process owns it, the file names the process; afterwards the file is removed.
 
     Raises:
         OSError: if the file system has no locks.
@@ -41,7 +41,7 @@ def claimed(file: Path) -> Iterator[bool]:
 
 
 def owner_of(file: Path) -> str:
-    """Who owns what ``file`` stands for, in words."""
+    """A description of the process that owns ``file``, for messages."""
     try:
         owner = json.loads(file.read_text())
         return f"process {owner['pid']} on {owner['host']}"

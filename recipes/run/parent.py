@@ -1,4 +1,4 @@
-"""Processes that do not outlive the one that started them, and leave signals to it."""
+"""Keeps processes from outliving the one that started them, and leaves signals to it."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import threading
 import time
 from collections.abc import Callable
 
-LOOK_EVERY = 0.5
-"""Seconds between two looks whether the parent still lives."""
+PARENT_CHECK_EVERY = 0.5
+"""Seconds between two checks whether the parent still lives."""
 
 
 def follow(parent: int, then: Callable[[], object]) -> None:
-    """Call ``then``, in a thread of its own, as soon as process ``parent`` no longer is this one's parent: it has died.
+    """Call ``then``, in a thread, as soon as process ``parent`` has died: then this process has another parent.
 
     Args:
         parent: number of the process that started this one.
-        then: what is to be done.
+        then: called without arguments.
     """
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(LOOK_EVERY)
+            time.sleep(PARENT_CHECK_EVERY)
         then()
 
     threading.Thread(target=watch, name="follow-parent", daemon=True).start()
@@ -40,11 +40,11 @@ def serve(parent: int) -> None:
 
 
 def end_with(parent: int, patience: float) -> None:
-    """Be told to end, by SIGTERM, as soon as ``parent`` has died; be killed ``patience`` seconds later.
+    """Send this process SIGTERM as soon as ``parent`` has died, and kill it ``patience`` seconds later.
 
     Args:
         parent: number of the process that started this one.
-        patience: for a last checkpoint [s].
+        patience: time for a last checkpoint [s].
     """
 
     def end() -> None:

@@ -1,4 +1,4 @@
-"""The learners of a run: one process, or as many as torchrun started, which learn the same weights together."""
+"""The processes of a run: one, or those that torchrun started, which learn the same weights together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.distributed.rendezvous import rendezvous
 from nht.recipes.run.parent import end_with
 
 PATIENCE = 60.0
-"""Seconds that a rank has for a last checkpoint when torchrun has died."""
+"""Seconds that a rank has for a last checkpoint after torchrun has died."""
 
 
 def usable_device(device: torch.device | str) -> torch.device:
@@ -36,15 +36,15 @@ def usable_device(device: torch.device | str) -> torch.device:
 
 
 class Ranks:
-    """This process among its fellows: what they average, add up and agree on. Alone, all of that does nothing.
+    """This process and its group: they average, add up and broadcast. For a single process all of that does nothing.
 
-    Every method is to be called by all ranks, in the same order. When the process that started them, torchrun, is
-    killed, they are told to end as by SIGTERM: a job that is queued again shall not meet them.
+    All ranks must call every method, in the same order. When torchrun, which started them, is killed, they get SIGTERM,
+    so that they are gone when a requeued job starts.
 
     Args:
         device: of the tensors; gloo connects CPUs, nccl GPUs.
-        seed: of this process's torch, alike in all: they make the same networks.
-        threads: that torch may use in each process.
+        seed: of torch in all processes, so that they make the same networks.
+        threads: number that torch may use in each process.
         tf32: whether a GPU may multiply float32 matrices in TF32.
 
     Attributes:
@@ -88,11 +88,11 @@ class Ranks:
 
     @property
     def folder(self) -> str:
-        """Where this process keeps what is its own, below a folder of the run; alone, in that folder itself."""
+        """Name of this process's own folder below one of the run; for a single process, that folder itself."""
         return f"rank-{self.rank}" if self.size > 1 else ""
 
     def part_ways(self, seed: int) -> None:
-        """From here on every process draws its own numbers; the first, or one alone, goes on as it is."""
+        """Let every process draw its own numbers from here on; the first, or a single one, goes on as it is."""
         if self.rank:
             torch.manual_seed(seed)
 
@@ -102,7 +102,7 @@ class Ranks:
         return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
     def share(self, name: str, number: int) -> int:
-        """This process's part of a number that all share alike.
+        """This process's equal share of a number.
 
         Raises:
             ValueError: if it cannot be divided.
@@ -136,7 +136,7 @@ class Ranks:
         return gathered
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Put the mean of all processes' gradients in the place of each one's own: one flat all-reduce."""
+        """Replace the gradients by their mean over all processes, in one flat all-reduce."""
         if self.size == 1:
             return
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
@@ -152,7 +152,7 @@ class Ranks:
             distributed.broadcast(value, src=0)
 
     def wait(self) -> None:
-        """Go on when all have come here."""
+        """Wait until all processes have called this."""
         if self.size > 1:
             distributed.barrier()
 

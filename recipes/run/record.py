@@ -1,4 +1,4 @@
-"""What a run says of itself: counted steps, rows of metrics, a progress bar."""
+"""The record of a run: counted steps, rows of metrics, and a progress bar."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from nht.recipes.run.statistics import Counters, TrainingStatistics
 
 
 class Record:
-    """Counts what a run does, and writes a row of metrics at every evaluation.
+    """Counts a run's steps and updates, and writes a row of metrics at every evaluation.
 
     Args:
         folder: where the rows go.
         ranks: the processes whose counts are added up.
         envs: the run's environments.
-        losses: what an update reports, by name; each becomes a column of ``metrics.csv``.
+        losses: names of the values that an update reports; each becomes a column of ``metrics.csv``.
 
     Attributes:
-        counters: environment steps and gradient steps so far, the steps of all processes; of each of several learners.
+        counters: environment steps (of all processes) and gradient steps so far, of each learner.
         statistics: sums since the last row.
     """
 
@@ -59,7 +59,7 @@ class Record:
         return self.counters.frames % self._every == 0
 
     def show_progress(self) -> None:
-        """Draw the bar, from where the run stands."""
+        """Show the progress bar, starting from the current step."""
         self._bar = progress_bar(
             self._total,
             self._folder.path.name,
@@ -70,7 +70,7 @@ class Record:
         )
 
     def count_steps(self, data: TensorDictBase) -> None:
-        """Take collected steps ``(copies, T)``, or ``(learners, copies, T)``, into counters and statistics."""
+        """Count collected steps ``(copies, T)``, or ``(learners, copies, T)``."""
         learners = self._envs.learners
         steps = data.numel() // (learners or 1) * self._ranks.size
         self.counters.frames += steps
@@ -79,7 +79,7 @@ class Record:
             self._bar.update(steps)
 
     def count_update(self, losses: TensorDictBase) -> None:
-        """Take a gradient step into counters and statistics."""
+        """Count a gradient step and add up its losses."""
         self.counters.updates += 1
         self.statistics.add_losses(losses)
 
@@ -90,7 +90,7 @@ class Record:
             FloatingPointError: if training has diverged, that of all learners.
         """
         outcomes = evaluate(self._envs.final_test if self.finished else self._envs.test, policy).each()
-        trained = self.statistics.take_each(self._ranks.sum)
+        trained = self.statistics.take(self._ranks.sum)
         rows = [
             found
             if isinstance(found, FloatingPointError)
@@ -106,6 +106,6 @@ class Record:
             show_beside(self._bar, **shown)
 
     def close(self) -> None:
-        """Leave the bar as it is."""
+        """Close the progress bar."""
         if self._bar is not None:
             self._bar.close()

@@ -1,4 +1,4 @@
-"""Whether a run that goes on is the run that was started: which of its settings may differ."""
+"""Checks that a resumed run is the one that was started: only some settings may differ."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ TAKEN = (
     "tf32",
     "run",
 )
-"""Settings that a run may go on with others of; all else is what its checkpoints were made for."""
+"""Settings that may differ in a resumed run; its checkpoints depend on all others."""
 
 
 def check_same(folder: Path, config: Training, algorithm: str, saved: Training) -> None:
-    """Check that a run can go on with a configuration, and fill in what it leaves to the run.
+    """Check that a run can be resumed with a configuration, and fill in the settings that this leaves open.
 
     Args:
         folder: of the run.
         config: the configuration to go on with.
-        algorithm: name of the one that the run is of.
+        algorithm: name of the run's algorithm.
         saved: the configuration that the run was started with.
 
     Raises:

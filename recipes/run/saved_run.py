@@ -1,4 +1,4 @@
-"""What the folder of a run says of it: its configuration, and its action map."""
+"""Reads a run's configuration and action map from its folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nht.storage import format_version
 
 CONFIG_FILE, MAP_FILE = "config.yaml", "map.safetensors"
 OLDEST_ALGORITHM = "ddpg"
-"""Of folders whose configuration does not say which algorithm it is for."""
+"""The algorithm of old folders, whose configuration does not name it."""
 
 
 def read_config(folder: Path, allow: Sequence[str] = ()) -> Training:
@@ -40,7 +40,7 @@ def read_config(folder: Path, allow: Sequence[str] = ()) -> Training:
 
 
 def read_run(folder: Path, allow: Sequence[str] = ()) -> tuple[str, Training]:
-    """The name of the algorithm that a run is of, and its configuration. Raises as ``read_config`` does."""
+    """The name of a run's algorithm, and the run's configuration. Raises as ``read_config`` does."""
     settings = folder / CONFIG_FILE
     saved = read_settings(settings)
     check_code(saved, settings, allow)
@@ -55,13 +55,13 @@ def read_run(folder: Path, allow: Sequence[str] = ()) -> tuple[str, Training]:
 def kept_map(
     folder: Path, config: Training, device: torch.device | str = "cpu", allow: Sequence[str] = ()
 ) -> nht.ActionMap:
-    """The action map of a run; of one that an earlier version made, with the scale that its configuration has.
+    """The action map of a run; if an earlier version made it, with the scale of the run's configuration.
 
     Args:
         folder: of the run.
         config: of the run.
         device: where the map goes.
-        allow: packages whose classes the map's file may name, beside that of the kind of map.
+        allow: packages whose classes the map's file may name, beside the package of the kind of map.
 
     Raises:
         FileNotFoundError, ValueError: as ``nht.load_map``.

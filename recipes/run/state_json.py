@@ -1,4 +1,4 @@
-"""State dictionaries as JSON and tensors beside it, in TorchRL's terms; what is read can only be plain values."""
+"""State dictionaries as JSON with tensors beside it, in TorchRL's format; reading gives plain values only."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from nht.recipes.torch_internals import layout_versions, set_layout_versions
 DEVICE = re.compile(r"cpu|(cuda|xpu|mps)(:\d{1,3})?")
 
 
-def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
-    """A value in JSON, where tensors and arrays stand by the names under which they are put into ``tensors``."""
+def as_json(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
+    """A value as JSON, with a name for each tensor or array; these are put into ``tensors`` by name."""
     if isinstance(value, (Tensor, np.ndarray)):
         key = f"tensor_{len(tensors):08d}"
         tensors[key] = value.detach() if isinstance(value, Tensor) else torch.from_numpy(value.copy())
@@ -27,16 +27,16 @@ def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
         return {"kind": "numpy", "key": key, "dtype": value.dtype.str}
     if isinstance(value, Mapping):
         about = layout_versions(value)
-        items = [[encoded(key, tensors), encoded(item, tensors)] for key, item in value.items()]
+        items = [[as_json(key, tensors), as_json(item, tensors)] for key, item in value.items()]
         kind = "ordered_dict" if isinstance(value, OrderedDict) else "dict"
         return {"kind": kind, "items": items} | (
-            {} if about is None else {"metadata": encoded(about, tensors)}
+            {} if about is None else {"metadata": as_json(about, tensors)}
         )
     if isinstance(value, (list, tuple)):
         if isinstance(value, torch.Size):
             return {"kind": "torch_size", "items": list(value)}
         kind = "list" if isinstance(value, list) else "tuple"
-        return {"kind": kind, "items": [encoded(item, tensors) for item in value]}
+        return {"kind": kind, "items": [as_json(item, tensors) for item in value]}
     if isinstance(value, np.generic):
         return {"kind": "numpy_scalar", "dtype": value.dtype.str, "value": value.item()}
     if value is None or isinstance(value, (bool, int, float, str)):
@@ -46,8 +46,8 @@ def encoded(value: Any, tensors: dict[str, Tensor]) -> dict[str, Any]:
     )
 
 
-def decoded(node: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
-    """What ``encoded`` made, and TorchRL before it: plain values, lists, dictionaries, tensors and arrays only."""
+def from_json(node: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
+    """The value that ``as_json``, or TorchRL, wrote: plain values, lists, dictionaries, tensors and arrays only."""
     if not isinstance(node, dict):
         raise ValueError(f"{where}/state.json holds {shortened(repr(node), 60)} where an object should be.")
     kind = entry(node, "kind", str, where)
@@ -68,7 +68,7 @@ def decoded(node: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
         items = entry(node, "items", list, where)
         if kind == "torch_size":
             return torch.Size(size for size in items if type(size) is int)
-        return {"list": list, "tuple": tuple}[kind](decoded(item, tensors, where) for item in items)
+        return {"list": list, "tuple": tuple}[kind](from_json(item, tensors, where) for item in items)
     raise ValueError(f"{where}/state.json holds a value of the unknown kind {shortened(kind, 60)!r}.")
 
 
@@ -77,19 +77,19 @@ def _mapping(node: dict[str, Any], tensors: Mapping[str, Tensor], where: str) ->
     for pair in entry(node, "items", list, where):
         if not isinstance(pair, list) or len(pair) != 2:
             raise ValueError(f"{where}/state.json holds a dictionary whose items are no pairs.")
-        key = decoded(pair[0], tensors, where)
+        key = from_json(pair[0], tensors, where)
         if not isinstance(key, (str, int, float, bool, type(None))):
             raise ValueError(
                 f"{where}/state.json holds a dictionary with a key that is a {type(key).__name__}."
             )
-        found[key] = decoded(pair[1], tensors, where)
+        found[key] = from_json(pair[1], tensors, where)
     if node.get("metadata") is not None and isinstance(found, OrderedDict):
-        set_layout_versions(found, decoded(node["metadata"], tensors, where))
+        set_layout_versions(found, from_json(node["metadata"], tensors, where))
     return found
 
 
 def _placed(tensor: Tensor, node: dict[str, Any], where: str) -> Tensor:
-    """On the device that it was saved from, if this machine has it."""
+    """The tensor on the device that it was saved from, if this machine has it."""
     device = entry(node, "device", str, where)
     if not DEVICE.fullmatch(device):
         raise ValueError(f"{where}/state.json names the unknown device {shortened(device, 60)!r}.")

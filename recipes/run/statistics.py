@@ -1,4 +1,4 @@
-"""What a run counts between two evaluations."""
+"""Counts and means of training between two evaluations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nht.recipes.run.metrics import CLIPPED, DIVERGED, FAILURE, SUCCESS, trained
 
 @dataclass
 class Counters:
-    """How far a run has come; checkpointed."""
+    """Numbers of environment steps and gradient steps so far; part of checkpoints."""
 
     frames: int = 0
     updates: int = 0
@@ -32,12 +32,13 @@ class Counters:
 
 
 class TrainingStatistics:
-    """Means since the last evaluation: losses, outcomes of the episodes that ended, and how actuations fared.
+    """Means since the last evaluation: losses, outcomes of ended episodes, and shares of clipped and diverged steps.
 
     Args:
         bounds: the actuation's space in the environment, which clips at its ``low`` and ``high``, ``(*batch, n)``.
-        losses: names under which an update reports.
-        learners: whose means are kept apart: steps are ``(learners, T)`` and losses ``(learners,)`` then.
+        losses: names of the losses that an update reports.
+        learners: number of learners with separate means, if several: steps are ``(learners, T)``, losses
+            ``(learners,)``.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class TrainingStatistics:
     def add_steps(self, steps: TensorDictBase) -> None:
         """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations.
 
-        As of losses, the sums stay tensors.
+        The sums stay tensors, as those of losses.
         """
         outcome = steps["next"]
         done, actuation = outcome["done"], outcome["actuation"]
@@ -78,7 +79,7 @@ class TrainingStatistics:
         self._sums[name] = self._sums[name] + self._count(flags)
 
     def _count(self, flags: torch.Tensor) -> torch.Tensor:
-        """How many of ``(T, 1)`` are true; of each learner's, where there are several."""
+        """The number of true flags ``(T, 1)``; for several learners, the number of each."""
         return flags.squeeze(-1).sum(-1).double()
 
     def state_dict(self) -> dict[str, Any]:
@@ -95,30 +96,26 @@ class TrainingStatistics:
         self._updates, self._episodes, self._steps = counts["updates"], counts["episodes"], counts["steps"]
         self._sums = defaultdict(float, saved.get("sums", {}))
 
-    def take(self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums) -> dict[str, float]:
-        """The means of one learner, starting anew; NaN where nothing was counted.
+    def take(
+        self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
+    ) -> list[dict[str, float] | FloatingPointError]:
+        """Return the means of every learner and reset; NaN where nothing was counted.
 
         Args:
             add: adds up the sums of all processes that train together.
 
-        Raises:
-            FloatingPointError: if a loss is no longer finite: the networks are lost.
+        Returns:
+            a row of metrics for each learner; an error in its place if its losses are no longer finite.
         """
-        (row,) = self.take_each(add)
-        if isinstance(row, FloatingPointError):
-            raise row
-        return row
-
-    def take_each(
-        self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
-    ) -> list[dict[str, float] | FloatingPointError]:
-        """The means of every learner, as ``take`` gives them; the error in the place of one whose networks are lost."""
         names = (SUCCESS, FAILURE, DIVERGED, CLIPPED, *self._losses)
         counted = (self._updates, self._episodes, self._steps, *(self._sums[name] for name in names))
         own = [torch.as_tensor(value, dtype=torch.float64).cpu() for value in counted]
         totals = add(torch.stack([value.expand(self._learners or 1) for value in own]))
         self._clear()
-        return [self._row(dict(zip(names, sums, strict=True)), *counts) for counts, sums in _split(totals)]
+        return [
+            self._row(dict(zip(names, sums, strict=True)), updates, episodes, steps)
+            for updates, episodes, steps, *sums in totals.T.tolist()
+        ]
 
     def _row(
         self, sums: dict[str, float], updates: float, episodes: float, steps: float
@@ -137,8 +134,3 @@ class TrainingStatistics:
             CLIPPED: sums[CLIPPED] / (steps or math.nan),  # steps with a motor at its limit
         }
         return row | {name: sums[name] / (updates or math.nan) for name in self._losses}
-
-
-def _split(totals: torch.Tensor) -> list[tuple[list[float], list[float]]]:
-    """Of every learner the three counts, and the sums."""
-    return [(column[:3], column[3:]) for column in totals.T.tolist()]

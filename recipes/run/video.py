@@ -1,4 +1,4 @@
-"""Films of test episodes: a grid of copies, with the tool's trail and how each of them fares."""
+"""Films of test episodes: a grid of copies with the tool's trail and the outcome of each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
-from nht.envs.rendering import coarse_shadows
+from nht.envs.offscreen import coarse_shadows
 from nht.envs.simulation import Simulation
 from nht.recipes.progress_bar import progress_bar
 from nht.recipes.run.evaluation import Evaluation, Policy, evaluate
@@ -34,12 +34,12 @@ BORDER = 4  # pixels
 
 
 def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
-    """Write one episode of every copy of ``env`` as an MP4 at the speed of real time, and a contact sheet beside it.
+    """Film one episode of every copy of ``env`` as an MP4 in real time, with a contact sheet beside it.
 
     A copy's tile has a trail of the tool, where the task has one, the time, and a border that says how the episode
     stands: green for success, red for failure. The tile of an episode that has ended stands still. Films have about
     ``MOST_FRAMES`` pictures at most: of long episodes fewer steps are filmed, and the film may then run several times
-    as fast as time, which its tiles say.
+    faster than real time, which its tiles say.
 
     Args:
         env: a batched task behind any transforms.
@@ -80,8 +80,8 @@ class Film:
     Attributes:
         frames: of every moment filmed, a picture ``(height, width, 3)`` per copy.
         frames_per_second: at which the film runs at ``speed``.
-        speed: times that of real time.
-        steps: that it may see, the reset included.
+        speed: as a multiple of real time.
+        steps: largest number of steps that are added, the reset included.
     """
 
     def __init__(self, task: Simulation) -> None:
@@ -101,7 +101,7 @@ class Film:
         self._running = np.ones(task.num_envs, dtype=bool)
 
     def add(self, outcome: TensorDictBase) -> None:
-        """Film what a reset or a step has brought, where it is time for a picture or an episode has ended."""
+        """Film the result of a reset or step if a picture is due or an episode has ended."""
         done, success, failure = (outcome[flag].view(-1).numpy() for flag in ("done", "success", "failure"))
         if (tool := outcome.get("tool_position", None)) is not None:
             self._trail.append(tool.double().numpy())
@@ -144,7 +144,7 @@ def grid(tiles: list[Picture]) -> Picture:
 
 
 def contact_sheet(frames: list[list[Picture]]) -> Picture:
-    """A row per copy: moments of its film from start to end, at half size."""
+    """One row per copy: pictures of its film from start to end, at half size."""
     moments = np.linspace(0, len(frames) - 1, SHEET_COLUMNS).round().astype(int)
     columns = [np.concatenate([tile[::2, ::2] for tile in frames[moment]], axis=0) for moment in moments]
     return np.concatenate(columns, axis=1)

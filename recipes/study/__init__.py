@@ -1,1 +1,1 @@
-"""Many runs: what is searched, who runs it, what came out."""
+"""Many runs: searches of hyperparameters, their execution, and their results."""

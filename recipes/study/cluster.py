@@ -1,4 +1,4 @@
-"""Many runs at a time, on this machine or on a cluster: Ray."""
+"""Runs many jobs at a time with Ray, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Cluster:
 
     Args:
         address: of a cluster, ``host:port`` or ``auto``; None starts Ray here.
-        num_workers: jobs at a time, where Ray is started here; None is one for each core.
+        num_workers: number of jobs at a time if Ray is started here; None is one for each core.
 
     Raises:
         ConnectionError: if nothing answers at ``address``.
@@ -61,13 +61,14 @@ class Cluster:
     def run(
         self, work: Callable[[Work, Path], object], tasks: Sequence[Work], folder: Path
     ) -> Iterator[Work]:
-        """Do ``work(task, folder)`` for all tasks, one core each, and give each back once it is done.
+        """Do ``work(task, folder)`` for all tasks, one core each, and yield each task once it is done.
 
-        A task whose worker dies is tried again, three times; then its runs are recorded as failed. Those that are told
+        A task whose worker dies is tried again, three times; then its runs are recorded as failed. Tasks with
         ``device=cuda`` get a GPU.
 
         Raises:
-            RuntimeError: if Ray itself fails, or a run can be neither begun nor recorded: that is no result of a run's.
+            RuntimeError: if Ray itself fails, or a run can be neither begun nor recorded, which is not the run's own
+                failure.
         """
         remote = ray.remote(num_cpus=1, num_gpus=_gpus(tasks), max_retries=3)(work)
         waiting = {remote.remote(task, folder): task for task in tasks}
@@ -93,7 +94,7 @@ class Cluster:
 
 
 def _gpus(tasks: Sequence[Job] | Sequence[Pack]) -> int:
-    """How many each needs: all tasks of a stage are told the same device."""
+    """Number of GPUs that each task needs: all tasks of a stage have the same device."""
     return int(any(word.startswith("device=cuda") for task in tasks[:1] for word in task.jobs[0].overrides))
 
 
@@ -109,11 +110,13 @@ def _check_answer(address: str) -> None:
     try:
         socket.create_connection((host, int(port)), timeout=ANSWER).close()
     except (OSError, ValueError) as error:
-        raise ConnectionError(f"no Ray cluster answers at ray_address={address}: {error}.") from error
+        raise ConnectionError(
+            f"no Ray cluster answers at ray_address={address}: {shortened(error)}."
+        ) from error
 
 
 def _check_machines() -> None:
-    """Every machine must have this package; what is sent there to look cannot need it."""
+    """Check that every machine has this package, with a function that does not need the package itself."""
 
     def installed() -> str | None:
         from importlib.metadata import PackageNotFoundError, version

@@ -1,4 +1,4 @@
-"""Learning curves of runs: read from their folders, grouped by what belongs together, as tables and figures."""
+"""Learning curves of runs: read from their folders, grouped, and shown in tables and figures."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from nht.recipes.study.figures import colour
 from nht.recipes.study.scores import interquartile_mean, interval
 
 LABELS = ("task", "algorithm", "interface", "seed")
-"""Columns that say whose an evaluation is."""
+"""Columns that identify the run of an evaluation."""
 
 
 def read_runs(folders: list[Path]) -> pandas.DataFrame:
     """The evaluations of all runs in or below ``folders``, a row each, with ``LABELS``.
 
-    An interface is named with its number of actions where runs of several are there. Nothing that a run's
+    An interface's name includes its number of actions if there are runs with several. Nothing that a run's
     configuration names is imported.
 
     Raises:
@@ -66,7 +66,7 @@ def _read_run(metrics: Path) -> pandas.DataFrame:
 
 
 def groups(curves: pandas.DataFrame, lines: str) -> Iterator[tuple[str, pandas.DataFrame]]:
-    """What belongs in one table and one figure, by a name for its files: one task and algorithm, or task and interface.
+    """The groups that share a table and a figure, each with a name for its files: one task and algorithm, or interface.
 
     Args:
         curves: as ``read_runs`` gives them.
@@ -78,9 +78,9 @@ def groups(curves: pandas.DataFrame, lines: str) -> Iterator[tuple[str, pandas.D
 
 
 def summarise(curves: pandas.DataFrame, metric: str = SUCCESS, lines: str = "interface") -> pandas.DataFrame:
-    """Per interface, or algorithm: seeds, steps, mean and interquartile mean over seeds of the last evaluation of all.
+    """Per interface or algorithm: seeds, steps, mean and interquartile mean over seeds of the last common evaluation.
 
-    For success also the failures, and the median of the steps to a success of 0.9.
+    For success, also the failures and the median number of steps to a success of 0.9.
     """
     rows = []
     shown = "{:.3f}" if metric == SUCCESS else "{:,.0f}"
@@ -110,13 +110,13 @@ def summarise(curves: pandas.DataFrame, metric: str = SUCCESS, lines: str = "int
 
 
 def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
-    """The evaluations of one interface that every one of its seeds has made: some runs may have gone on for longer."""
+    """The evaluations of one interface that all its seeds have reached: some runs may have gone on for longer."""
     seeds = group.groupby(FRAMES)["seed"].transform("nunique")
     return group[seeds == group["seed"].nunique()]
 
 
 def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path, lines: str = "interface") -> None:
-    """Mean over the seeds of every interface, or algorithm, with its interval, against environment steps."""
+    """Plot the mean over seeds of every interface or algorithm, with its interval, against environment steps."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for name, group in curves.groupby(lines, sort=False):
         by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]

@@ -21,7 +21,7 @@ from nht.recipes.run.metrics import FRAMES, SUCCESS, tested
 from nht.recipes.study.results import SearchResults
 from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
-OTHERS = ("#A6761D", "#7570B3", "#E7298A")
+OTHER_COLOURS = ("#A6761D", "#7570B3", "#E7298A")
 """Colours of interfaces whose kind of map has none of its own."""
 REPEATABLE: Any = {"svg.hashsalt": "nht", "savefig.dpi": 150, "font.size": 10}
 BAND_RESAMPLES = 500
@@ -29,12 +29,12 @@ BAND_RESAMPLES = 500
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture of the report.
+    """A figure of the report.
 
     Attributes:
-        name: of its files, without what follows the dot.
+        name: of its files, without the suffix.
         title: its heading.
-        caption: what is to be seen.
+        caption: what it shows.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Figure:
 
 
 def draw_all(results: SearchResults, out: Path) -> list[Figure]:
-    """Write every figure into ``out``; correlations need two configurations that differ."""
+    """Write every figure into ``out``; the one of correlations needs two different configurations."""
     drawings = [_violins, _curves, _profile, _budget]
     if len(results.correlations()):
         drawings.append(_correlations)
@@ -52,14 +52,14 @@ def draw_all(results: SearchResults, out: Path) -> list[Figure]:
 
 
 def colour(interface: str) -> str:
-    """The colour of an interface, the same in every figure: that of its kind of map, or one that its name decides."""
+    """The colour of an interface in all figures: that of its kind of map, or else one derived from its name."""
     kind = "none" if interface == "raw" else interface
     known = KINDS[kind].colour if kind in list(KINDS) else None
-    return known or OTHERS[sum(interface.encode()) % len(OTHERS)]
+    return known or OTHER_COLOURS[sum(interface.encode()) % len(OTHER_COLOURS)]
 
 
 def _line(interface: str) -> dict[str, Any]:
-    """How its curve is drawn: ours is wide, to be seen beneath others that end as high."""
+    """The line style of an interface's curve: ours is wide, so that it shows beneath other curves."""
     return {"color": colour(interface), "linewidth": 3.0 if interface == "nht" else 1.5}
 
 

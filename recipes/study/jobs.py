@@ -1,4 +1,4 @@
-"""The runs of a search, and how each of them came out: claimed by one process, run as a person would, recorded."""
+"""The runs of a search: each is claimed by one process, run like a command of a user, and its outcome recorded."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class Job:
     Attributes:
         stage: ``search``, or ``best`` for a best configuration on fresh seeds.
         env: the task's name.
-        interface: whose run.
+        interface: the interface of the run.
         configuration: its number.
         seed: of map and agent.
         recipe: ``ddpg`` or ``ppo``.
         metric: what the run is judged by, ``success`` or ``return``.
         parameters: what was drawn, by dotted name.
-        overrides: everything that the recipe is told, the run's folder aside.
+        overrides: all overrides for the recipe, except the run's folder.
     """
 
     stage: str
@@ -55,12 +55,12 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Of the run's folder, below the search's."""
+        """Name of the run's folder below the search's."""
         return job_name(self.stage, self.interface, self.configuration, self.seed)
 
     @property
     def jobs(self) -> tuple[Job, ...]:
-        """The runs that are done together: this one."""
+        """The runs that are done together: only this one."""
         return (self,)
 
 
@@ -69,20 +69,20 @@ def job_name(stage: str, interface: str, configuration: int, seed: int) -> str:
     return f"{stage}/{interface}/{configuration:03d}-seed{seed}"
 
 
-ENDINGS = ("done", "failed", "diverged")
+STATUSES = ("done", "failed", "diverged")
 
 TRIES = 3
-"""How often a run is started whose workers die: that says nothing about what was drawn. Each goes on where it was."""
+"""How often a run is started if its workers die, which is not the fault of its settings. It resumes each time."""
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run came out.
+    """The outcome of a run.
 
     Attributes:
         status: ``done``, ``failed`` or ``diverged``.
-        reason: why.
-        core_seconds: processor time of the process that ended it, its share of it if several runs trained together [s].
+        reason: of a failure.
+        core_seconds: processor time of the process that ended it [s]; the run's share if several trained together.
     """
 
     status: str
@@ -91,19 +91,19 @@ class Ending:
 
     @classmethod
     def read(cls, run: Path) -> Ending | None:
-        """What was recorded in the run's folder; None if the run has not ended.
+        """The outcome recorded in the run's folder; None if the run has not ended.
 
         Raises:
-            ValueError: if something else stands there.
+            ValueError: if the file there is no such record.
         """
         file = run / "outcome.json"
         if not file.exists():
             return None
         record = read_json(file)
         known_entries(record, ("status", "reason", "core_seconds"), str(file))
-        if entry(record, "status", str, str(file)) not in ENDINGS:
+        if entry(record, "status", str, str(file)) not in STATUSES:
             raise ValueError(
-                f"{file}: 'status' must be one of {list(ENDINGS)}, got {shortened(record['status'], 60)!r}."
+                f"{file}: 'status' must be one of {list(STATUSES)}, got {shortened(record['status'], 60)!r}."
             )
         spent = record.get("core_seconds")
         if not (spent is None or (isinstance(spent, int | float) and 0 <= spent < math.inf)):
@@ -119,15 +119,15 @@ class Ending:
 
 
 def run_job(job: Job, folder: Path) -> Ending | None:
-    """Train map and agent, or go on where another process was stopped; what fails is recorded, not raised.
+    """Train map and agent, or resume where another process stopped; a failure is recorded, not raised.
 
     Args:
         job: what to run.
         folder: of the search.
 
     Returns:
-        the outcome, also of a run that had ended before; None if another process is at it, whether for this search or,
-        in the run's own folder, for a person.
+        the outcome, also of a run that had ended before; None if another process works on it, for this search or, in
+        the run's own folder, for a user.
     """
     run = folder / job.name
     if (outcome := Ending.read(run)) is not None:
@@ -148,7 +148,7 @@ def run_job(job: Job, folder: Path) -> Ending | None:
 
 
 def _train(job: Job, run: Path) -> Ending:
-    """How the run came out; raises OwnedError if another process writes its folder."""
+    """Train, and return the outcome; raises OwnedError if another process writes the folder."""
     run.mkdir(parents=True, exist_ok=True)
     algorithm = find_algorithm(job.recipe)
     overrides = [*job.overrides, f"run.folder={run}", "run.resume=auto"]
@@ -172,7 +172,7 @@ def _train(job: Job, run: Path) -> Ending:
 
 
 def _until_workers_live(train: Callable[[], None]) -> None:
-    """Train; again, a few times at most, if a collector's worker died."""
+    """Train, and try again at most a few times if a collector's worker dies."""
     for left in reversed(range(TRIES)):
         try:
             return train()

@@ -33,19 +33,19 @@ class Pack:
 
     @property
     def name(self) -> str:
-        """Of the pack, by what is in it."""
+        """The pack's name, derived from its runs."""
         if len(self.jobs) == 1:
             return self.jobs[0].name
         return f"packs/{self.jobs[0].stage}-{crc32(' '.join(job.name for job in self.jobs).encode()):08x}"
 
     def halves(self) -> tuple[Pack, Pack]:
-        """Two packs of half as many."""
+        """The pack split into two."""
         middle = len(self.jobs) // 2
         return Pack(self.jobs[:middle]), Pack(self.jobs[middle:])
 
 
-def packed(jobs: Sequence[Job], learners: int) -> list[Pack]:
-    """All runs of a stage in packs of at most ``learners``; those of nearly the same batch size together.
+def in_packs(jobs: Sequence[Job], learners: int) -> list[Pack]:
+    """All runs of a stage in packs of at most ``learners``, grouped by similar batch size.
 
     Raises:
         ValueError: if the algorithm trains one learner at a time.
@@ -66,7 +66,7 @@ def packed(jobs: Sequence[Job], learners: int) -> list[Pack]:
 
 
 def _shape(job: Job, varies: Sequence[str]) -> str:
-    """Alike for runs whose learners can share every call."""
+    """A key that is equal for runs whose learners can train together."""
     own = {f"algo.{name}" for name in varies}
     shared = {
         name: value
@@ -80,11 +80,11 @@ def _shape(job: Job, varies: Sequence[str]) -> str:
 
 
 def run_pack(pack: Pack, folder: Path) -> None:
-    """Train the learners of a pack together, or go on where another process was stopped; outcomes are recorded.
+    """Train the learners of a pack together, or resume where another process stopped; outcomes are recorded.
 
-    Runs that have ended take no part. A pack that fails, for want of memory or because of one of its runs, is halved,
-    and both halves are trained: so one run that cannot be does not cost the others. A run that another process is at,
-    here or elsewhere, is left to it.
+    Runs that have ended are left out. A pack that fails, for lack of memory or because of one of its runs, is halved
+    and both halves are trained, so that one bad run does not cost the others. A run that another process works on is
+    left to it.
 
     Args:
         pack: what to run.
@@ -113,11 +113,11 @@ def run_pack(pack: Pack, folder: Path) -> None:
 
 
 class _NotTogetherError(Exception):
-    """These runs could not be trained together."""
+    """Raised if runs cannot be trained together."""
 
 
 def _members(pack: Pack, folder: Path) -> list[Job]:
-    """The runs that train together: the same when the pack is taken up again, for its checkpoints are of these."""
+    """The runs that train together: the same when the pack is resumed, as its checkpoints are of these."""
     note = folder / pack.name / "members.json"
     if note.exists():
         names = read_json(note).get("members", [])

@@ -1,4 +1,4 @@
-"""The report of a search: its raw rows, read, checked and told in tables, figures and a page."""
+"""The report of a search: tables, figures and a page from its raw rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas
 
 from nht.recipes.run.metrics import FRAMES, SUCCESS
 from nht.recipes.study import figures as search_figures
-from nht.recipes.study.results import OURS, SearchResults, read_results
+from nht.recipes.study.results import OUR_INTERFACE, SearchResults, read_results
 from nht.recipes.study.scores import (
     Scores,
     interquartile_mean,
@@ -21,12 +21,12 @@ from nht.recipes.study.scores import (
     resampled,
 )
 
-Sections = list[tuple[str | None, str | pandas.DataFrame]]
-"""Of the page: headings, and what stands below them."""
+PageSections = list[tuple[str | None, str | pandas.DataFrame]]
+"""Sections of the page: a heading, and the text or table below it."""
 
 
 def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
-    """Write figures (PNG, SVG), ``report.md`` and ``report.html``; the first table.
+    """Write figures (PNG, SVG), ``report.md`` and ``report.html``; returns the first table.
 
     The same rows give the same files, byte for byte.
     """
@@ -34,8 +34,8 @@ def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
     out.mkdir(parents=True, exist_ok=True)
     title = title or f"Search on {', '.join(results.rows['env'].unique())}"
     figures = search_figures.draw_all(results, out)
-    table = summary(results)
-    sections: Sections = [
+    table = search_summary(results)
+    sections: PageSections = [
         (None, f"{counts(results)}\n"),
         ("Interfaces", table),
         ("Failed runs", failures(results)),
@@ -47,7 +47,7 @@ def write_report(file: Path, out: Path, title: str) -> pandas.DataFrame:
 
 
 def counts(results: SearchResults) -> str:
-    """How much was run, in a sentence."""
+    """A sentence with the numbers of runs."""
     runs = results.stage("search")
     again = results.stage("best")
     text = (
@@ -62,8 +62,8 @@ def counts(results: SearchResults) -> str:
     return f"{text}. Score: {results.metric} of the test episodes after the last step. Intervals: 95 %, bootstrap."
 
 
-def summary(results: SearchResults) -> pandas.DataFrame:
-    """A row per interface: how it does over configurations, and at its best."""
+def search_summary(results: SearchResults) -> pandas.DataFrame:
+    """The summary, a row per interface: scores over configurations, and of the best one."""
     rng = np.random.default_rng(0)
     digits = ".3f" if results.metric == SUCCESS else ",.0f"
     rows = []
@@ -83,7 +83,7 @@ def summary(results: SearchResults) -> pandas.DataFrame:
                 "best configuration": number,
                 "its score": f"{best.mean():{digits}} ({ends[0]:{digits}} .. {ends[1]:{digits}})",
                 "on": f"{len(best)} fresh seeds" if fresh else "the search's seeds",
-                f"P({OURS} better)": _improvement(results, interface, rng),
+                f"P({OUR_INTERFACE} better)": _improvement(results, interface, rng),
             }
         )
     return pandas.DataFrame(rows)
@@ -97,9 +97,9 @@ def _scores_of(results: SearchResults, interface: str, configuration: int, stage
 
 def _improvement(results: SearchResults, interface: str, rng: np.random.Generator) -> str:
     """The probability that ours beats an interface, with its interval, over the configurations that both have."""
-    if interface == OURS or OURS not in results.interfaces:
+    if interface == OUR_INTERFACE or OUR_INTERFACE not in results.interfaces:
         return "-"
-    tables = results.table(OURS), results.table(interface)
+    tables = results.table(OUR_INTERFACE), results.table(interface)
     both = tables[0].index.intersection(tables[1].index)
     if both.empty:
         return "no configuration in common"
@@ -152,7 +152,7 @@ def categories(results: SearchResults) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def _markdown(title: str, sections: Sections, figures: list[search_figures.Figure]) -> str:
+def _markdown(title: str, sections: PageSections, figures: list[search_figures.Figure]) -> str:
     parts = [f"# {title}\n"]
     for heading, content in sections:
         parts += [f"## {heading}\n"] if heading else []
@@ -180,8 +180,8 @@ tr { border-bottom: 1px solid #ddd } img { max-width: 100% } p { color: #555 }
 """
 
 
-def _html(title: str, sections: Sections, figures: list[search_figures.Figure], out: Path) -> str:
-    """One file, pictures included."""
+def _html(title: str, sections: PageSections, figures: list[search_figures.Figure], out: Path) -> str:
+    """The page as one file, with the figures embedded."""
     parts = [f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"]
     parts.append(f"<h1>{html.escape(title)}</h1>")
     for heading, content in sections:

@@ -1,4 +1,4 @@
-"""What a search left behind: its raw rows, read and checked."""
+"""The results of a search, from its raw rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nht.recipes.run.metrics import SUCCESS, tested
 from nht.recipes.study.rows_file import COLUMNS, CORE_SECONDS, MAP_ERROR, read_rows
 from nht.recipes.study.scores import Scores
 
-OURS = "nht"
+OUR_INTERFACE = "nht"
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class SearchResults:
     """Rows of a search, and the final score of every run.
 
     Attributes:
-        rows: one per evaluation.
-        runs: one per run, with its ``score``: the last evaluation, or the worst there is if it did not get there.
+        rows: one row per evaluation.
+        runs: one row per run, with its ``score``: the last evaluation, or the worst of all if it did not reach its end.
         metric: ``success`` or ``return``.
     """
 
@@ -32,15 +32,15 @@ class SearchResults:
 
     @classmethod
     def of(cls, rows: pandas.DataFrame) -> SearchResults:
-        """The results in rows that are known to be good."""
+        """The results in rows that have been checked."""
         metric = str(rows["metric"].iloc[0])
         return cls(rows, final_scores(rows, metric), metric)
 
     @property
     def interfaces(self) -> list[str]:
-        """In the order of the rows, ours first."""
+        """The interfaces in the order of the rows, ours first."""
         found = list(dict.fromkeys(self.rows["interface"]))
-        return sorted(found, key=lambda name: name != OURS)
+        return sorted(found, key=lambda name: name != OUR_INTERFACE)
 
     @property
     def parameters(self) -> list[str]:
@@ -58,7 +58,7 @@ class SearchResults:
         return own.pivot(index="configuration", columns="seed", values="score").dropna()
 
     def scores(self, interface: str) -> Scores:
-        """The same, ``(configurations, seeds)``."""
+        """Final scores as an array ``(configurations, seeds)``."""
         return self.table(interface).to_numpy()
 
     def best(self, interface: str) -> tuple[int, pandas.DataFrame, bool]:
@@ -96,7 +96,7 @@ def read_results(file: Path) -> SearchResults:
 
 
 def final_scores(rows: pandas.DataFrame, metric: str) -> pandas.DataFrame:
-    """The last evaluation of every run as its ``score``; of one that did not get to its end, the worst there is."""
+    """The last evaluation of every run as its ``score``; for a run that did not reach its end, the worst of all."""
     runs = rows.groupby(["stage", "interface", "configuration", "seed"], sort=False).tail(1).copy()
     score = runs[tested(metric)].astype(float)
     worst = 0.0 if metric == SUCCESS else score.min()

@@ -1,4 +1,4 @@
-"""``rows.csv`` of a search, read and checked: a row for each evaluation of each run."""
+"""Reads and checks ``rows.csv`` of a search: a row for each evaluation of each run."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ COLUMNS = (
     "reason",
     *EVERY_RUN,
 )
-"""Of ``rows.csv``; those behind them are costs, where they were noted, and hyperparameters."""
+"""Columns of ``rows.csv``; further columns are costs, where they were recorded, and hyperparameters."""
 
 CORE_SECONDS, MAP_ERROR = "core_seconds", "map_error"
-"""Processor time of the whole run [s], and the held-out error of the map that it trained; same in all its rows."""
+"""Processor time of the whole run [s], and held-out error of the map that it trained; the same in all its rows."""
 
 CHOICES = {
     "metric": (SUCCESS, RETURN),
@@ -37,7 +37,7 @@ CHOICES = {
 TEXTS = ("version", "reason", "env", "interface")
 COUNTS = ("configuration", "seed")
 NUMBERS = EVERY_RUN
-"""Missing where a run failed before its first evaluation."""
+"""Columns that are empty where a run failed before its first evaluation."""
 
 
 def read_rows(file: Path) -> pandas.DataFrame:
@@ -67,7 +67,7 @@ def read_rows(file: Path) -> pandas.DataFrame:
 
 
 def _check_widths(file: Path, text: str) -> None:
-    """As many values in each line as there are columns; pandas would shift or fill them."""
+    """Check that each line has as many values as there are columns; pandas would shift or fill them."""
     try:
         lines = csv.reader(io.StringIO(text, newline=""), strict=True)
         heading = next(lines, [])

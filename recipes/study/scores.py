@@ -1,4 +1,4 @@
-"""What many scores say: intervals, best of n, profiles, probabilities of improvement.
+"""Statistics of many scores: intervals, best of n, profiles, probabilities of improvement.
 
 A ``(configurations, seeds)`` array holds the scores of one interface. Every function that draws takes a generator.
 """
@@ -27,7 +27,7 @@ def interval(
 ) -> tuple[float, float]:
     """Bootstrap interval of a statistic over seeds ``(seeds,)`` (percentiles); a point for one seed.
 
-    Without ``rng`` it is always the same generator.
+    Without ``rng`` it uses a generator of a fixed seed.
     """
     if len(scores) < 2 or np.ptp(scores) == 0:
         return float(scores.mean()), float(scores.mean())
@@ -49,8 +49,8 @@ def resampled(
 
     Args:
         scores: ``(configurations, seeds)``.
-        rng: draws.
-        resamples: how many.
+        rng: generator of the draws.
+        resamples: number of bootstrap samples.
         configurations: False keeps the configurations as they are and draws seeds only (a stratified bootstrap).
 
     Returns:
@@ -95,7 +95,7 @@ def best_of(scores: Scores) -> Scores:
 
 
 def probability_of_improvement(ours: Scores, theirs: Scores) -> Any:
-    """How likely one of our runs beats one of theirs of the same configuration, ties counting half: ``(...)``.
+    """Probability that one of our runs beats one of theirs of the same configuration, ties counting half: ``(...)``.
 
     Agarwal et al. 2021, with configurations in the place of tasks.
 

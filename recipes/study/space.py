@@ -1,4 +1,4 @@
-"""The hyperparameters of a search: distributions, what is drawn from them, and the manifest that keeps it."""
+"""The hyperparameters of a search: their distributions, the draws from them, and the search's manifest."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from nht.writing import replacing
 Value = int | float | str
 ROWS_FORMAT = 1
 VERSION = f"{version('nht')}/{ROWS_FORMAT}"
-"""Of everything that a search writes: rows of different versions do not go together."""
+"""Version of everything that a search writes: rows of different versions cannot be combined."""
 
 GROWING = ("configs", "seeds", "best_seeds")
-"""Settings that a search may be continued with more of."""
+"""Settings that may be increased when a search is continued."""
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """Where a hyperparameter is drawn from (Bergstra & Bengio 2012 define the kinds).
+    """The distribution of a hyperparameter (Bergstra & Bengio 2012 define the kinds).
 
     Args:
         kind: ``uniform``, ``integer`` (uniform, both ends included), ``exponential`` (uniform in the logarithm),
-            ``geometric`` (that, rounded to an integer) or ``choice`` (each as likely).
+            ``geometric`` (the same, rounded to an integer) or ``choice`` (each equally likely).
         values: low and high, or the choices.
     """
 
@@ -42,7 +42,7 @@ class Distribution:
         """From ``{kind: values}`` in a YAML file.
 
         Raises:
-            ValueError: for an unknown kind, or values that it cannot have.
+            ValueError: for an unknown kind, or values that do not fit it.
         """
         if len(written) != 1 or next(iter(written)) not in DISTRIBUTIONS:
             raise ValueError(
@@ -62,7 +62,7 @@ class Distribution:
         return cls(kind, tuple(values))
 
     def at(self, quantile: float) -> Value:
-        """The value that the share ``quantile`` in [0, 1) of all draws lies below."""
+        """The value of the quantile in [0, 1)."""
         return (
             DISTRIBUTIONS[self.kind](quantile, *self.values)
             if self.kind != "choice"
@@ -103,18 +103,18 @@ Space = dict[str, dict[str, dict[str, list[Any]]]]
 distribution, its values."""
 
 
-def draw(space: Space, seed: int, configuration: int, interface: str) -> dict[str, Value]:
+def draw_settings(space: Space, seed: int, configuration: int, interface: str) -> dict[str, Value]:
     """One configuration of an interface: a value for each of its hyperparameters.
 
     Every hyperparameter has a generator of its own, seeded by its name, the search's seed and the configuration's
     number. So a value depends neither on what else is drawn nor on how many configurations there are; all interfaces
-    share the agent's; and where one has a range of its own, it gets the same quantile of it.
+    share the agent's; an interface with its own range gets the same quantile of it.
 
     Args:
         space: the distributions.
         seed: of the search.
         configuration: its number.
-        interface: whose.
+        interface: its name.
 
     Raises:
         ValueError: for a distribution that does not exist.
@@ -127,12 +127,12 @@ def draw(space: Space, seed: int, configuration: int, interface: str) -> dict[st
 
 
 def quantile(seed: int, configuration: int, name: str) -> float:
-    """What one hyperparameter's generator draws, in [0, 1)."""
+    """The draw of one hyperparameter's generator, in [0, 1)."""
     return float(np.random.default_rng([seed, configuration, crc32(name.encode())]).random())
 
 
-def write_manifest(path: Path, settings: dict[str, Any]) -> None:
-    """Write the search's manifest; one that is there already must be of the same search.
+def write_search_manifest(path: Path, settings: dict[str, Any]) -> None:
+    """Write the search's manifest; an existing one must be of the same search.
 
     Args:
         path: of the JSON file.
@@ -143,13 +143,13 @@ def write_manifest(path: Path, settings: dict[str, Any]) -> None:
     """
     manifest = {"version": VERSION, "settings": settings}
     if path.exists():
-        _check_same(path, read_manifest(path), manifest)
+        _check_same(path, read_search_manifest(path), manifest)
     with replacing(path) as scratch:
         scratch.write_text(json.dumps(manifest, indent=1))
 
 
-def read_manifest(path: Path) -> dict[str, Any]:
-    """What ``write_manifest`` wrote: ``version`` and ``settings``. Raises ValueError on anything else."""
+def read_search_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of a search, with ``version`` and ``settings``. Raises ValueError for any other file."""
     manifest = read_json(path)
     known_entries(manifest, ("version", "settings"), str(path))
     entry(manifest, "version", str, str(path))

@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
 
 from fresh_process import run
-from nht.envs import make_dm_control, make_env, make_gymnasium, rendering
+from nht.envs import display, make_dm_control, make_env, make_gymnasium
 
 pytestmark = pytest.mark.usefixtures("can_render")
 
@@ -111,11 +111,11 @@ print(nht.envs.make_env("wam_wipe", seed=0).render(width=32, height=24).shape)
 
 
 @pytest.mark.parametrize(
-    "display", ["", ":99", "localhost:77", "nowhere.invalid:0", "nonsense", ":", "/tmp/x:0"]
+    "named", ["", ":99", "localhost:77", "nowhere.invalid:0", "nonsense", ":", "/tmp/x:0"]
 )
-def test_displays_that_nobody_serves(display, monkeypatch):
-    monkeypatch.setenv("DISPLAY", display)
-    assert not rendering.display_answers()
+def test_displays_that_nobody_serves(named, monkeypatch):
+    monkeypatch.setenv("DISPLAY", named)
+    assert not display.display_answers()
 
 
 def test_without_a_display_that_answers_egl_is_taken():
@@ -138,12 +138,12 @@ def test_a_display_that_answers(monkeypatch, tmp_path):
     monkeypatch.setenv("DISPLAY", f"localhost:{server.getsockname()[1] - 6000}.0")
     accepting = threading.Thread(target=server.accept, daemon=True)
     accepting.start()
-    assert rendering.display_answers()
+    assert display.display_answers()
     accepting.join()  # a socket in use by a thread is not closed yet
     server.close()
-    assert not rendering.display_answers()
+    assert not display.display_answers()
     monkeypatch.delenv("DISPLAY")
-    assert not rendering.display_answers()
+    assert not display.display_answers()
 
 
 def test_a_local_display_that_answers(monkeypatch):
@@ -151,4 +151,4 @@ def test_a_local_display_that_answers(monkeypatch):
         server.bind("\0/tmp/.X11-unix/X7351")
         server.listen()
         monkeypatch.setenv("DISPLAY", ":7351")
-        assert rendering.display_answers()
+        assert display.display_answers()

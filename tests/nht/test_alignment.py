@@ -17,7 +17,7 @@ from nht.envs.wam_kinematics import forward_kinematics
 from nht.maps import ActionMap, LinearActionMap
 from nht.recipes.config import TrainMap
 from nht.recipes.data.recording import record_expert
-from nht.recipes.maps.interface import load_kind, train_map
+from nht.recipes.maps.interface import map_from_file, trained_map
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.train import projection_error
 from nht.transforms import ActionMapTransform
@@ -168,8 +168,8 @@ def test_the_tool_follows_the_axes_of_a_map_trained_on_wam_wipe(tmp_path: Path) 
     demos = record_expert(task, DemosConfig(transitions=2000), 0, tmp_path / "demos")
     settings = MapConfig(hidden=[32], max_steps=500, action_scale=None)
     folder = DemosConfig(path=str(tmp_path / "demos"))
-    plain = train_map(settings, task, folder, 3).map
-    aligned, metrics = train_map(settings, task, folder, 3, align="tool")
+    plain = trained_map(settings, task, folder, 3).map
+    aligned, metrics = trained_map(settings, task, folder, 3, align="tool")
     assert isinstance(aligned, nht.Aligned)
     assert metrics["action_scale"] == float(aligned.action_scale) != float(plain.action_scale)
 
@@ -192,8 +192,8 @@ def test_the_tool_follows_the_axes_of_a_map_trained_on_wam_wipe(tmp_path: Path) 
     corrected = nht.Residual(aligned, 0.1)
     for map in (aligned, corrected):  # what a run is told of its map's kind still holds
         file = nht.save_map(map, tmp_path / f"{type(map).__name__}.safetensors")
-        assert type(load_kind(MapConfig("nht", str(file), residual=0.1))) is nht.Residual
-    found = load_kind(MapConfig("nht", str(tmp_path / "Aligned.safetensors")))
+        assert type(map_from_file(MapConfig("nht", str(file), residual=0.1))) is nht.Residual
+    found = map_from_file(MapConfig("nht", str(tmp_path / "Aligned.safetensors")))
     assert type(found) is nht.Aligned
     assert torch.equal(found.action_scale, aligned.action_scale)
 
@@ -296,6 +296,6 @@ def test_an_alignment_to_the_tool_that_cannot_be_is_refused_before_training(
     )
     demos, env = DemosConfig(path=str(tmp_path / "demos")), EnvConfig(name=task, context_keys=["c"])
     with pytest.raises(ValueError, match=message):
-        train_map(MapConfig(kind=kind, action_dim=k, max_steps=10**9), env, demos, 0, align="tool")
+        trained_map(MapConfig(kind=kind, action_dim=k, max_steps=10**9), env, demos, 0, align="tool")
     with pytest.raises(ValueError, match="align must be tool, or null for axes as they come out, got 'x'"):
         TrainMap(align="x")

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import nht
-from nht.map_classes import OURS
+from nht.map_classes import OUR_CLASSES
 from no_sync import Waits
 
 CONTEXT, MOTORS, K, BATCH = 4, 7, 2, 5
@@ -34,7 +34,7 @@ MAPS = {
 
 
 def test_every_map_is_here():
-    assert {type(make()) for make in MAPS.values()} == set(OURS.values())
+    assert {type(make()) for make in MAPS.values()} == set(OUR_CLASSES.values())
 
 
 @pytest.fixture(params=["scale", "clip"])

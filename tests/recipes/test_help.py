@@ -18,7 +18,7 @@ from nht.recipes.config import (
     Search,
     TrainMap,
 )
-from nht.recipes.help import help_text, meanings, shown
+from nht.recipes.help import as_typed, help_text, meanings
 from nht.recipes.launch import launch
 from nht.recipes.overrides import section
 
@@ -91,9 +91,9 @@ def test_every_setting_says_what_it_means(schema):
 
 def test_values_are_shown_as_they_are_typed():
     shows = {None: "null", True: "true", 3: "3", "a b": "a b", "null": "null"}
-    assert {value: shown(value) for value in shows} == shows
-    assert shown([1, 2]) == "[1, 2]"
-    assert shown({"start": "fixed", "x": None}) == "{start: fixed, x: null}"
+    assert {value: as_typed(value) for value in shows} == shows
+    assert as_typed([1, 2]) == "[1, 2]"
+    assert as_typed({"start": "fixed", "x": None}) == "{start: fixed, x: null}"
 
 
 def test_a_setting_too_long_for_its_column_has_its_meaning_below():

@@ -233,7 +233,7 @@ HOSTILE_FOLDERS = [
 def test_a_hostile_folder_of_a_tensordict(attack, message, folder, outside, tmp_path):
     attack(folder, outside)
     refused(folder, lambda: read_tensordict(folder), message)
-    refused(folder, lambda: inspect_demos.read(str(folder)), message)
+    refused(folder, lambda: inspect_demos.read_source(str(folder)), message)
     overrides = ["source=tensordict", f"source.path={folder}", "env.name=toy", f"out={tmp_path / 'out'}"]
     config = configure(CollectDemos, "collect_demos", overrides)
     refused(folder, lambda: collect_demos.main(config), message)
@@ -498,7 +498,7 @@ def postscript(folder: Path, outside: Path, module: str) -> None:
 def test_a_hostile_minari_dataset(attack, message, dataset, outside, hostile_module, tmp_path):
     attack(dataset, outside, hostile_module)
     reads = [lambda: nht.from_minari(dataset), lambda: nht.from_minari("toy-v0")]
-    reads += [lambda: inspect_demos.read(str(dataset.parent))]
+    reads += [lambda: inspect_demos.read_source(str(dataset.parent))]
     overrides = ["source=minari", "source.path=toy-v0", "env.name=toy", f"out={tmp_path / 'out'}"]
     reads += [lambda: collect_demos.main(configure(CollectDemos, "collect_demos", overrides))]
     for read in reads:

@@ -12,7 +12,7 @@ import nht
 from nht.recipes import inspect_demos
 from nht.recipes.config import InspectDemos
 from nht.recipes.data import summary
-from nht.recipes.data.figure import draw
+from nht.recipes.data.figure import draw_figure
 from nht.recipes.data.files import Episodes
 from nht.recipes.launch import configure
 
@@ -69,7 +69,7 @@ def test_the_summary_says_what_is_in_the_demonstrations(saved, capsys):
 
 
 def test_success_is_that_of_the_last_steps(saved):
-    text = summary.summary(inspect_demos.read(str(saved)), directions=4)
+    text = summary.demos_summary(inspect_demos.read_source(str(saved)), directions=4)
     assert "success  0.667 of the episodes, at their last step" in text
     assert "not finite  none" in text
 
@@ -102,7 +102,7 @@ def test_the_figure_is_drawn_for_any_number_of_motors_and_episodes(motors, tmp_p
             batch_size=total,
         )
         data["actuation"][:, 0] = 0.0  # a motor that stands still
-        figure = draw(Episodes(data, 0), directions=10)
+        figure = draw_figure(Episodes(data, 0), directions=10)
         figure.savefig(tmp_path / "figure.png", dpi=30)
         assert iio.imread(tmp_path / "figure.png").std() > 10
 
@@ -159,4 +159,4 @@ def test_without_minari_a_wrong_path_is_still_told_apart(tmp_path, monkeypatch):
     with pytest.raises(
         FileNotFoundError, match=r"holds no demonstrations, no TensorDict and no Minari dataset"
     ):
-        inspect_demos.read(str(tmp_path))
+        inspect_demos.read_source(str(tmp_path))

@@ -14,7 +14,7 @@ from nht.lipschitz import LipschitzProjection
 from nht.recipes import collect_demos, ddpg, evaluate, report, train_map
 from nht.recipes.config import DDPG, CollectDemos, Evaluate, Report, TrainMap
 from nht.recipes.launch import configure
-from nht.recipes.maps.interface import load_kind
+from nht.recipes.maps.interface import map_from_file
 from nht.recipes.maps.kinds import make_map, map_context_keys
 from nht.recipes.sections import MapConfig
 from nht.recipes.study.curves import summarise
@@ -132,15 +132,15 @@ def test_the_papers_settings_run(map_file, tmp_path):
 def test_any_map_can_have_corrections(demos, map_file, tmp_path):
     overrides = ["map=svd", "map.residual=0.1", f"demos.path={demos}", f"out={tmp_path / 'svd'}"]
     train_map.main(configure(TrainMap, "train_map", overrides))
-    saved = load_kind(MapConfig("svd", str(tmp_path / "svd"), residual=0.1))
+    saved = map_from_file(MapConfig("svd", str(tmp_path / "svd"), residual=0.1))
     assert (saved.action_dim, saved.scale) == (9, 0.1)
     train(tmp_path / "run", map_file, "map.residual=0.2", "algo.total_frames=1000")  # around a map without
     used = nht.load_map(tmp_path / "run" / "map.safetensors")
     assert (type(used), used.scale, type(used.map)) == (nht.Residual, 0.2, nht.NHT)
     with pytest.raises(ValueError, match=r"a map with residual 0\.1, but map\.residual is None"):
-        load_kind(MapConfig("svd", str(tmp_path / "svd")))
+        map_from_file(MapConfig("svd", str(tmp_path / "svd")))
     with pytest.raises(ValueError, match=r"holds a SVD, but map\.kind is 'nht'"):
-        load_kind(MapConfig("nht", str(tmp_path / "svd"), residual=0.1))
+        map_from_file(MapConfig("nht", str(tmp_path / "svd"), residual=0.1))
     with pytest.raises(
         ValueError, match=r"map\.residual must be positive, or null for no corrections, got -1\.0"
     ):

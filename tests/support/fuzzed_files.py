@@ -33,7 +33,7 @@ from nht.recipes.run.statistics import Counters
 from nht.recipes.sections import SourceConfig
 from nht.recipes.study.jobs import Ending
 from nht.recipes.study.results import read_results
-from nht.recipes.study.space import read_manifest, write_manifest
+from nht.recipes.study.space import read_search_manifest, write_search_manifest
 from toy_demos import as_rollout, demonstrations, episodes, write_hdf5
 from untouched import only_reads
 
@@ -210,7 +210,7 @@ def make_outcome(folder: Path) -> list[Path]:
 
 
 def make_manifest(folder: Path) -> list[Path]:
-    write_manifest(
+    write_search_manifest(
         folder / "manifest.json", {"configs": 3, "seeds": 2, "space": {"agent": {"a": [0.1, 1.0]}}}
     )
     return [folder / "manifest.json"]
@@ -235,7 +235,7 @@ KINDS: dict[str, Kind] = {
     "rows.csv": Kind(make_rows, read_rows, sealed=False),
     "outcome.json": Kind(make_outcome, Ending.read, sealed=False),
     "manifest.json of a search": Kind(
-        make_manifest, lambda folder: read_manifest(folder / "manifest.json"), sealed=False
+        make_manifest, lambda folder: read_search_manifest(folder / "manifest.json"), sealed=False
     ),
 }
 

@@ -16,7 +16,7 @@ import nht.envs
 from nht.recipes import collect_demos, ddpg
 from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import DDPG, CollectDemos
-from nht.recipes.data.recording import endings, has_success, record
+from nht.recipes.data.recording import endings, has_success, record_episodes
 from nht.recipes.launch import configure
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.saved_run import read_config
@@ -311,7 +311,9 @@ def test_where_a_task_knows_no_success_the_return_decides():
         )
 
     keys = list(env.task.observation_sizes)
-    data, left_out = record(env, env.task, act, DemosConfig(transitions=120, min_return=-20.0), judged=False)
+    data, left_out = record_episodes(
+        env, env.task, act, DemosConfig(transitions=120, min_return=-20.0), judged=False
+    )
     returns = torch.zeros(int(data["episode"][-1]) + 1).index_add(
         0, data["episode"], data["reward"].squeeze(-1)
     )
@@ -320,7 +322,7 @@ def test_where_a_task_knows_no_success_the_return_decides():
     with pytest.raises(
         RuntimeError, match=r"no episode in 2,400 steps had a success and a return of at least 5.0"
     ):
-        record(env, env.task, act, DemosConfig(transitions=10, min_return=5.0), judged=True)
+        record_episodes(env, env.task, act, DemosConfig(transitions=10, min_return=5.0), judged=True)
     env.close()
     assert has_success("wam_wipe")
     assert endings("no task of ours") == {}

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 import nht
 import tiny_runs
 from nht.envs import make_env
-from nht.envs.rendering import coarse_shadows
+from nht.envs.offscreen import coarse_shadows
 from nht.recipes.run.environments import mapped_env
 from nht.recipes.run.evaluation import evaluate
 from nht.recipes.run.video import (

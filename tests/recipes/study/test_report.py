@@ -8,7 +8,7 @@ import toy_search
 from nht.recipes import report
 from nht.recipes.config import Report
 from nht.recipes.launch import configure
-from nht.recipes.study.report import failures, summary
+from nht.recipes.study.report import failures, search_summary
 from nht.recipes.study.results import SearchResults, final_scores, read_results
 
 FIGURES = ("violins", "curves", "profile", "budget", "correlations")
@@ -40,7 +40,7 @@ def test_the_same_rows_give_the_same_report(tmp_path, metric, capsys):
 
 def test_the_table_tells_the_interfaces_apart():
     rows = toy_search.rows()
-    table = summary(SearchResults.of(rows)).set_index("interface")
+    table = search_summary(SearchResults.of(rows)).set_index("interface")
     assert list(table.index) == ["nht", "raw", "laser", "svd", "scl", "jacobian"]
     assert table.loc["raw", "P(nht better)"].startswith("1.00")
     assert table.loc["nht", "P(nht better)"] == "-"
@@ -105,7 +105,7 @@ def test_only_fresh_runs_of_the_configuration_that_is_best_now_count():
     fresh = (rows["stage"] == "best") & (rows["interface"] == "nht")
     formerly = rows[fresh].assign(configuration=0, eval_success=0.0)
     before, after = (
-        summary(SearchResults.of(found)).set_index("interface").loc["nht"]
+        search_summary(SearchResults.of(found)).set_index("interface").loc["nht"]
         for found in (rows, pandas.concat([rows, formerly], ignore_index=True))
     )
     assert before["best configuration"] != 0
@@ -118,7 +118,7 @@ def test_interfaces_are_compared_over_the_configurations_that_both_have():
     lacking = rows[~(ours & (rows["configuration"] == 0)) & ~(theirs & (rows["configuration"] == 3))]
     common = rows[~((ours | theirs) & rows["configuration"].isin([0, 3]))]
     found, expected = (
-        summary(SearchResults.of(some)).set_index("interface").loc["svd", "P(nht better)"].split()[0]
+        search_summary(SearchResults.of(some)).set_index("interface").loc["svd", "P(nht better)"].split()[0]
         for some in (lacking, common)
     )
     assert found == expected

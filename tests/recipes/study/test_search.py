@@ -19,6 +19,7 @@ from nht.recipes.launch import configure
 from nht.recipes.run.ownership import claimed
 from nht.recipes.run.workers import WorkerEndedError
 from nht.recipes.study import cluster as cluster_module
+from nht.recipes.study import plan
 from nht.recipes.study.jobs import TRIES, Ending, Job, rows_of, run_job
 
 BASE = [
@@ -160,7 +161,7 @@ def test_failures_are_recorded_and_do_not_stop_the_others(cluster, recipe, tmp_p
 
 def test_a_run_is_what_a_person_would_type(recipe, tmp_path):
     config = configure(Search, "search", ["search=wam", "search.base=['algo=ddpg']"]).search
-    nht, raw = (search.make_job(config, "demos", "search", name, 3, 1, 200_000) for name in ("nht", "raw"))
+    nht, raw = (plan.make_job(config, "demos", "search", name, 3, 1, 200_000) for name in ("nht", "raw"))
     for one in (nht, raw):
         assert run_job(one, tmp_path) == Ending("done")
     learned, plain = recipe.configs
@@ -354,7 +355,7 @@ def test_a_worker_that_dies_is_replaced(tmp_path):
     """The worker is killed once its first checkpoint is there; another one goes on from it."""
     folder = tmp_path / "search"
     config = configure(Search, "search", [*SMOKE, "search.interfaces=[raw]", "search.total_frames=4000"])
-    (run,) = search.search_jobs(config.search, tmp_path)
+    (run,) = plan.search_jobs(config.search, tmp_path)
     cluster = cluster_module.Cluster(num_workers=1)
     try:
         finished = cluster.run(killed_once, [run], folder)

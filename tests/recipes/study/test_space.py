@@ -9,7 +9,7 @@ from scipy import stats
 
 from nht.recipes.config import Search
 from nht.recipes.launch import configure
-from nht.recipes.study.space import Distribution, draw, write_manifest
+from nht.recipes.study.space import Distribution, draw_settings, write_search_manifest
 
 SPACE = {
     "agent": {"algo.gamma": {"uniform": [0.9, 0.99]}, "map.action_scale": {"exponential": [1.0, 10.0]}},
@@ -49,7 +49,7 @@ def test_integers_and_choices_are_equally_likely():
 
 def test_interfaces_share_the_draw_of_the_agent():
     for number in range(20):
-        nht, svd, raw = (draw(SPACE, 0, number, name) for name in ("nht", "svd", "raw"))
+        nht, svd, raw = (draw_settings(SPACE, 0, number, name) for name in ("nht", "svd", "raw"))
         assert {name: nht[name] for name in svd} == svd
         assert nht["algo.gamma"] == raw["algo.gamma"]
         # The same quantile of another range: log10 scale from 0 to 1, and from -1 to 1.
@@ -60,18 +60,20 @@ def test_interfaces_share_the_draw_of_the_agent():
 
 
 def test_a_draw_depends_on_its_place_alone():
-    values = {draw(SPACE, seed, number, "svd")["algo.gamma"] for seed in range(4) for number in range(5)}
+    values = {
+        draw_settings(SPACE, seed, number, "svd")["algo.gamma"] for seed in range(4) for number in range(5)
+    }
     assert len(values) == 20
     less = {"agent": {"algo.gamma": SPACE["agent"]["algo.gamma"]}}
-    assert draw(less, 1, 2, "svd")["algo.gamma"] == draw(SPACE, 1, 2, "nht")["algo.gamma"]
+    assert draw_settings(less, 1, 2, "svd")["algo.gamma"] == draw_settings(SPACE, 1, 2, "nht")["algo.gamma"]
     # Written down, for it must be the same on every machine.
-    assert draw(SPACE, 0, 0, "svd")["algo.gamma"] == pytest.approx(0.973336192302298, abs=1e-12)
+    assert draw_settings(SPACE, 0, 0, "svd")["algo.gamma"] == pytest.approx(0.973336192302298, abs=1e-12)
 
 
 def test_the_papers_tables():
     wam = configure(Search, "search", ["search=wam"]).search
     assert (wam.configs, wam.seeds, wam.total_frames) == (128, 5, 1_000_000)
-    many = [draw(wam.space, 0, number, "nht") for number in range(500)]
+    many = [draw_settings(wam.space, 0, number, "nht") for number in range(500)]
     for name, low, high in [
         ("algo.actor_learning_rate", 1e-4, 1e-2),
         ("algo.critic_learning_rate", 1e-4, 1e-2),
@@ -93,7 +95,7 @@ def test_the_papers_tables():
     assert {configuration["map.activation"] for configuration in many} == {"relu", "sigmoid", "tanh"}
     cheetah = configure(Search, "search", ["search=half_cheetah"]).search
     assert (cheetah.recipe, cheetah.metric) == ("ppo", "return")
-    rates = [draw(cheetah.space, 0, number, "raw")["algo.frames_per_batch"] for number in range(100)]
+    rates = [draw_settings(cheetah.space, 0, number, "raw")["algo.frames_per_batch"] for number in range(100)]
     assert set(rates) == {1024, 2048, 4096}
 
 
@@ -118,11 +120,11 @@ def test_distributions_that_do_not_exist(written, message):
 def test_a_manifest_is_of_one_search(tmp_path):
     path = tmp_path / "manifest.json"
     settings = {"configs": 8, "seeds": 3, "space": SPACE, "seed": 0}
-    write_manifest(path, settings)
-    write_manifest(path, settings | {"configs": 128, "seeds": 5})  # more of the same
+    write_search_manifest(path, settings)
+    write_search_manifest(path, settings | {"configs": 128, "seeds": 5})  # more of the same
     assert json.loads(path.read_text())["settings"]["configs"] == 128
     with pytest.raises(ValueError, match=r"is of another search: configs was 128, is 8; seed was 0, is 1\."):
-        write_manifest(path, settings | {"seeds": 5, "seed": 1})
+        write_search_manifest(path, settings | {"seeds": 5, "seed": 1})
     path.write_text(json.dumps({"version": "0.0.1/1", "settings": settings}))
     with pytest.raises(ValueError, match=r"was written by version 0\.0\.1/1, this is"):
-        write_manifest(path, settings)
+        write_search_manifest(path, settings)
