@@ -1,6 +1,7 @@
 """A search that is killed, or whose workers are, goes on by the same command: every run as if nothing had happened.
 
-The number of searches is in the environment variable ``NHT_KILLED_RUNS``.
+The environment variable ``NHT_KILLED_RUNS`` says how many searches; ``NHT_KILLED_RUNS_FIRST``, from which draw on;
+``NHT_KILLS``, a file for a row of each kill.
 """
 
 import os
@@ -11,6 +12,7 @@ import pytest
 from safetensors import safe_open
 
 import killed_searches
+from kill_table import newest, noted
 
 RUNS = int(os.environ.get("NHT_KILLED_RUNS", "1"))
 FIRST = int(os.environ.get("NHT_KILLED_RUNS_FIRST", "0"))
@@ -38,6 +40,8 @@ SETTINGS = [
     "demos.transitions=500",
 ]
 
+KILLED = {"search": "its process", "worker": "Ray's workers"}
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
@@ -49,16 +53,24 @@ def whole(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # starts Ray up to four times
 @pytest.mark.parametrize("number", range(FIRST, FIRST + RUNS))
-def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path, record_property):
+def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path):
     undisturbed, seconds = whole
     draw, folder = random.Random(f"search {number}"), tmp_path / "search"
     attacks = [
         (draw.uniform(0, seconds), draw.choice(["search", "worker"])) for _ in range(draw.randint(1, 3))
     ]
-    kills = [killed_searches.kill_after(time, victim, folder, SETTINGS) for time, victim in attacks]
-    record_property("kills", sum(kills))
-    print(f"search {number}: (time, victim) {attacks} of {seconds:.1f} s: {kills}")
-    killed_searches.finish(folder, SETTINGS)
+    with noted("search", number, seconds) as kills:
+        for time, victim in attacks:
+            if killed_searches.kill_after(time, victim, folder, SETTINGS):
+                kills.append((KILLED[victim], time, newest(folder)))
+        killed_searches.finish(folder, SETTINGS)
+        assert_same(folder, undisturbed)
+    before = contents(folder)
+    killed_searches.finish(folder, SETTINGS)  # whole, it has nothing left to do
+    assert contents(folder) == before
+
+
+def assert_same(folder, undisturbed):
     rows = [rows_of(path) for path in (folder, undisturbed)]
     pandas.testing.assert_frame_equal(*rows)
     assert set(rows[0]["status"]) == {"done"}
@@ -67,7 +79,7 @@ def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path, 
         for name in ("policy.safetensors", "whole.json", "outcome.json"):
             assert (mended / name).read_bytes() == (run / name).read_bytes(), mended / name
         assert header(mended / "map.safetensors") == header(run / "map.safetensors")
-    assert names(folder) == names(undisturbed)  # nothing is left lying about
+    assert sorted(contents(folder)) == sorted(contents(undisturbed))  # nothing is left lying about
 
 
 def header(file):
@@ -80,5 +92,5 @@ def rows_of(folder):
     return pandas.read_csv(folder / "rows.csv", keep_default_na=False).drop(columns="seconds")
 
 
-def names(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
