@@ -5,6 +5,7 @@
 
 import os
 import random
+import re
 
 import pandas
 import pytest
@@ -60,4 +61,6 @@ def test_a_run_of_two_is_mended_by_the_same_command(whole, number, tmp_path):
 
 
 def names(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+    """Of its files; ranks that were told to end have written a checkpoint then, after other steps than usual."""
+    files = (str(path.relative_to(folder)) for path in folder.rglob("*"))
+    return sorted(re.sub(r"checkpoint-\d+", "checkpoint", name) for name in files)
