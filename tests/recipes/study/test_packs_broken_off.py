@@ -59,7 +59,7 @@ def assert_ended(folder: Path, whole: Path) -> None:
         assert policies[0] == policies[1]
 
 
-@pytest.mark.parametrize("written", [0, 1])
+@pytest.mark.parametrize("written", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_broken_off_between_outcomes(
     written: int, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
