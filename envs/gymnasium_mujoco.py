@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, GymEnv
 from nht.envs.foreign import ForeignEnv
 from nht.envs.gymnasium_copies import GymnasiumCopy, InfoReader, NativeCopy, gymnasium_copy
 from nht.envs.outcome import INFO_FLAGS
+from nht.reading import shortened
 
 
 def make_gymnasium(
@@ -44,7 +45,8 @@ def make_gymnasium(
     Raises:
         ImportError: if the environment is one of Gymnasium-Robotics, which is not installed, or needs another package.
         KeyError: if a reset's ``info`` lacks one of the ``info_keys``.
-        ValueError: for an id that does not exist, with some that do; for actions or observations of other kinds.
+        ValueError: for an id that does not exist, with some that do; for options that it does not take; for actions or
+            observations of other kinds.
     """
     _check_id(name)
     return ForeignEnv(
@@ -79,6 +81,8 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
             f"{name} needs {error.name}, which is not installed; Gymnasium's own MuJoCo tasks: "
             "pip install 'gymnasium[mujoco]'."
         ) from error
+    except (TypeError, OverflowError) as error:
+        raise ValueError(f"{name} cannot be made with the options {options}: {shortened(error)}.") from error
     copy = gymnasium_copy(env)
     drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
         "render_modes", []

@@ -40,6 +40,8 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
     name, the constructor's arguments, the context's keys in order and the saturation; for whoever reads only the header
     k, n, scale, bounds, certificate, the fingerprint of the data and the version; and a checksum over all of it.
 
+    The same map gives the same bytes.
+
     Returns:
         The path.
 
@@ -53,7 +55,7 @@ def save_map(map: ActionMap, path: str | Path) -> Path:
     text = json.dumps(describe(map))
     header = {"format": MAP_FORMAT, "format_version": str(MAP_FORMAT_VERSION), "map": text}
     header["checksum"] = _checksum(text, tensors)
-    content = save(tensors, header)
+    content = _in_order(save(tensors, header))
     with replacing(path) as scratch:
         scratch.write_bytes(content)
     return path
@@ -85,6 +87,16 @@ def load_map(path: str | Path, device: torch.device | str = "cpu", *, allow: Seq
         reason = str(error) if known else f"its description is damaged: {type(error).__name__}: {error}"
         raise ValueError(f"{path} {shortened(reason, LONGEST_REASON)}.") from error
     return map.to(device).eval().requires_grad_(False)
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with what it says beside its tensors by name: safetensors writes that in any order."""
+    start = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:start])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, ensure_ascii=False, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of their numbers' size
+    return len(text).to_bytes(8, "little") + text + content[start:]
 
 
 def _checksum(text: str, tensors: dict[str, Tensor]) -> str:

@@ -92,6 +92,9 @@ def run_all(jobs: Sequence[Job], folder: Path, cluster: Cluster, ended: EndedRun
         for job in jobs
         if job.name not in ended and Ending.read(folder / job.name) is not None
     }
+    for claim in (folder / "claims").glob("*"):
+        with claimed(claim):
+            pass  # what a killed process left is gone then; whoever is alive keeps his
     with progress(jobs, folder) as show:
         show(ended)
         while missing := [job for job in jobs if job.name not in ended]:

@@ -93,8 +93,10 @@ def storable(steps: TensorDictBase) -> TensorDictBase:
     """
     if steps.ndim == 3:
         return steps.select(*STORED).flatten(1, 2).transpose(0, 1)
-    flat = steps.reshape(-1)
-    return flat[flat["action"].isfinite().all(-1)].select(*STORED)
+    flat = steps.reshape(-1).select(*STORED)
+    return flat[
+        flat["action"].isfinite().all(-1).nonzero().squeeze(-1)
+    ]  # a mask is waited for at every entry
 
 
 def minibatches(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import gettempdir
 
 import torch
 
@@ -20,6 +20,10 @@ from nht.recipes.maps.kinds import (
 from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig, Training
 from nht.storage import format_version
+from nht.writing import scratch
+
+SCRATCH = "nht-demonstrations"
+"""Name of what is recorded for one map alone, where temporary files are; the next run removes a killed one's."""
 
 
 def trained_map(
@@ -41,9 +45,10 @@ def trained_map(
             arm, or of a map that is not linear or has more than six axes.
     """
     keys = map_context_keys(map, env)
-    with TemporaryDirectory() as scratch:
+    with scratch(Path(gettempdir()) / SCRATCH) as place:
         if demos.path is None:
-            data = record_expert(env, demos, seed, Path(scratch) / "demos")
+            place.mkdir(mode=0o700)
+            data = record_expert(env, demos, seed, place / "demos")
         else:
             data = nht.load_demos(demos.path, env=env.name)
         context_dim = data.context(keys).shape[-1]

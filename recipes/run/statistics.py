@@ -84,7 +84,12 @@ class TrainingStatistics:
 
     def state_dict(self) -> dict[str, Any]:
         """The sums so far."""
-        counts = {"updates": self._updates, "episodes": int(self._episodes), "steps": self._steps}
+        episodes = torch.as_tensor(self._episodes)
+        counts = {
+            "updates": self._updates,
+            "episodes": int(episodes) if self._learners is None else episodes,  # of each of them
+            "steps": self._steps,
+        }
         return {
             "counts": counts,
             "sums": {name: torch.as_tensor(total) for name, total in self._sums.items()},

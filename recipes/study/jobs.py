@@ -142,8 +142,9 @@ def run_job(job: Job, folder: Path) -> Ending | None:
             except OwnedError:
                 return None
             outcome = replace(outcome, core_seconds=time.process_time() - begun)
+            # Buffers are large. First, for nobody looks there again once the outcome stands.
+            shutil.rmtree(run / "checkpoints", ignore_errors=True)
             outcome.write(run)
-            shutil.rmtree(run / "checkpoints", ignore_errors=True)  # buffers are large
     return outcome
 
 

@@ -19,6 +19,7 @@ from nht.recipes.quiet import quiet_libraries
 from nht.recipes.run.ownership import OwnedError, claimed
 from nht.recipes.run.population import diverged
 from nht.recipes.study.jobs import Ending, Job, run_job
+from nht.writing import replacing
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,11 @@ def run_pack(pack: Pack, folder: Path) -> None:
         if not ours:
             return
         members = _members(pack, folder)
+        endings: dict[str, Ending] = {}
         try:
             if len(members) < 2:
                 raise _NotTogetherError
-            _train_together(members, folder, folder / pack.name)
+            endings = _train_together(members, folder, folder / pack.name)
         except OwnedError:
             return
         except _NotTogetherError:
@@ -108,8 +110,11 @@ def run_pack(pack: Pack, folder: Path) -> None:
                 Pack(tuple(members)).halves() if len(members) > 1 else [Pack((job,)) for job in members]
             ):
                 run_pack(half, folder)
-        shutil.rmtree(folder / pack.name / "checkpoints", ignore_errors=True)  # buffers are large
+        # Buffers are large. First, for nobody looks there again once the outcomes stand.
+        shutil.rmtree(folder / pack.name / "checkpoints", ignore_errors=True)
         (folder / pack.name / "members.json").unlink(missing_ok=True)
+        for name, ending in endings.items():
+            ending.write(folder / name)
 
 
 class _NotTogetherError(Exception):
@@ -123,12 +128,13 @@ def _members(pack: Pack, folder: Path) -> list[Job]:
         names = read_json(note).get("members", [])
         return [job for job in pack.jobs if job.name in names]
     members = [job for job in pack.jobs if Ending.read(folder / job.name) is None]
-    note.parent.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps({"members": [job.name for job in members]}))
+    with replacing(note) as scratch:
+        scratch.write_text(json.dumps({"members": [job.name for job in members]}))
     return members
 
 
-def _train_together(jobs: Sequence[Job], folder: Path, together: Path) -> None:
+def _train_together(jobs: Sequence[Job], folder: Path, together: Path) -> dict[str, Ending]:
+    """Train the learners of these runs, and give the outcome of each by its name."""
     algorithm = find_algorithm(jobs[0].recipe)
     configs = [
         configure(
@@ -158,7 +164,8 @@ def _train_together(jobs: Sequence[Job], folder: Path, together: Path) -> None:
     if any(diverged(folder / job.name) is None for job in jobs) and reason:
         raise _NotTogetherError
     spent = (time.process_time() - begun) / len(jobs)
-    for job in jobs:
-        why = diverged(folder / job.name)
-        ending = Ending("done", "", spent) if why is None else Ending("diverged", why, spent)
-        ending.write(folder / job.name)
+    reasons = {job.name: diverged(folder / job.name) for job in jobs}
+    return {
+        name: Ending("done", "", spent) if why is None else Ending("diverged", why, spent)
+        for name, why in reasons.items()
+    }

@@ -339,6 +339,22 @@ def test_a_file_that_may_not_be_read_is_said_to_be_there(path: Path, monkeypatch
         load_map(path)
 
 
+def test_a_map_is_written_alike_every_time(tmp_path: Path) -> None:
+    map = nht.NHT(2, 5, 2, hidden=(3,))
+    map.context_keys = ("joint angle \u00e9", "\x7f\n")  # text that JSON may write in several ways
+    files = [save_map(map, tmp_path / f"{number}.safetensors").read_bytes() for number in range(20)]
+    assert len(set(files)) == 1
+    assert load_map(tmp_path / "0.safetensors").context_keys == map.context_keys
+    size = 8 + int.from_bytes(files[0][:8], "little")
+    assert size % 8 == 0
+    assert list(json.loads(files[0][8:size])["__metadata__"]) == [
+        "checksum",
+        "format",
+        "format_version",
+        "map",
+    ]
+
+
 def test_folders_and_devices_are_no_map_files(tmp_path: Path) -> None:
     for other in (tmp_path, Path("/dev/zero")):
         with pytest.raises(ValueError, match=f"{other} is no file that holds a map"):

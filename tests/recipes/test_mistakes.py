@@ -66,6 +66,10 @@ def test_a_gpu_beyond_those_there_are_is_told(monkeypatch):
         (["env.name=moon"], "unknown environment 'moon': choose from"),
         (["env.suite=theirs"], "unknown env.suite 'theirs': choose from"),
         (["env=gymnasium", "env.name=Moon-v0"], "gymnasium has no environment 'Moon-v0'"),
+        (
+            ["env=gymnasium", "env.name=InvertedPendulum-v5", "+env.options.width=1000000000000"],
+            "InvertedPendulum-v5 cannot be made with the options {'width': 1000000000000}: ",
+        ),
         (["env=torchrl", "env.name=nowhere:make"], "No module named 'nowhere'"),
         (["map.kind=pca"], "unknown"),
     ],

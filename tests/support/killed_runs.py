@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import tempfile
 import time
 
 import tiny_runs
@@ -15,7 +16,8 @@ def train(algorithm, folder, overrides, barrier=None):
     if barrier is not None:
         barrier.wait()
     speak_into(folder.with_suffix(".log"))
-    tiny_runs.train(algorithm, folder, "run.resume=auto", *overrides)
+    tempfile.tempdir = str(folder.parent)  # where a test sees what is left
+    tiny_runs.start(algorithm, folder, "run.resume=auto", *overrides)
 
 
 def speak_into(file):
@@ -41,14 +43,22 @@ def finish(algorithm, folder, overrides):
     return time.monotonic() - began
 
 
-def kill_after(seconds, algorithm, folder, overrides):
-    """Kill it then; whether it was still running."""
+def kill_after(seconds, algorithm, folder, overrides, since=None):
+    """Kill it so long after its start, or after it has written the file ``since``; whether it was still running."""
+    before = written(folder, since)
     process = start(algorithm, folder, overrides)
+    while since is not None and process.is_alive() and written(folder, since) == before:
+        time.sleep(0.005)
     process.join(seconds)
     process.kill()
     process.join()
     assert process.exitcode in (0, -9), words(folder)
     return process.exitcode != 0
+
+
+def written(folder, name):
+    """When the newest file of that name beneath a folder was written [ns]; 0 if there is none."""
+    return max((file.stat().st_mtime_ns for file in folder.rglob(name or "")), default=0)
 
 
 def words(folder):

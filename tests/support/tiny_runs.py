@@ -31,8 +31,13 @@ def settings(algorithm, folder, *overrides):
     return [*SHARED, *OWN[algorithm], f"run.folder={folder}", *overrides]
 
 
-def train(algorithm, folder, *overrides):
-    """Train, and give the metrics without what differs from time to time."""
+def start(algorithm, folder, *overrides):
+    """Train a run, or go on with it, to its end."""
     found = find_algorithm(algorithm)
     found.train(configure(found.schema, algorithm, settings(algorithm, folder, *overrides)))
+
+
+def train(algorithm, folder, *overrides):
+    """Train, and give the metrics without what differs from time to time."""
+    start(algorithm, folder, *overrides)
     return pandas.read_csv(folder / "metrics.csv").drop(columns="seconds")

@@ -1,8 +1,10 @@
 """Killed at any time, once or several times, a run is mended by the same command, and ends as if nothing had happened.
 
-The number of runs for each algorithm is in the environment variable ``NHT_KILLED_RUNS``.
+The environment variable ``NHT_KILLED_RUNS`` says how many runs of each kind; ``NHT_KILLED_RUNS_FIRST``, from which draw
+on; ``NHT_KILLS``, a file for a row of each kill.
 """
 
+import json
 import os
 import random
 
@@ -10,67 +12,71 @@ import pandas
 import pytest
 
 import killed_runs
-from nht.recipes.data.recording import record_expert
-from nht.recipes.sections import DemosConfig, EnvConfig
+from kill_table import newest, noted
 
-RUNS = int(os.environ.get("NHT_KILLED_RUNS", "3"))
+RUNS = int(os.environ.get("NHT_KILLED_RUNS", "2"))
 FIRST = int(os.environ.get("NHT_KILLED_RUNS_FIRST", "0"))
-SETTINGS = [
-    "algo.total_frames=600",
-    "evaluation.every=300",
-    "evaluation.video=true",
-    "map=nht",
-    "map.max_steps=100",
-    "map.hidden=[8]",
-]
+SHARED = ["algo.total_frames=600", "evaluation.every=300"]
+MAP = ["map=nht", "map.max_steps=100", "map.hidden=[8]", "demos.transitions=500"]
+FILM = ["evaluation.video=true", "env.options.max_episode_steps=5"]
+
+KINDS = {
+    "alone": ([], None, None),
+    "making its map": (MAP, "config.yaml", "map.safetensors"),
+    "filming": (FILM, "policy.safetensors", "whole.json"),
+    "population": ([*MAP, "seeds=3"], None, None),
+}
+"""What a run is told, and between which two of its files it is killed: None is its start, and its end."""
 
 
-@pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("demos") / "demos"
-    record_expert(EnvConfig(name="wam_wipe"), DemosConfig(transitions=500), 5, folder)
-    return folder
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request):
+    return request.param
 
 
 @pytest.fixture(scope="module", params=["ddpg", "ppo"])
-def whole(request, demos, tmp_path_factory):
-    """The algorithm, what it is told, a run that nothing disturbed, and its duration in seconds."""
-    folder = tmp_path_factory.mktemp(request.param) / "whole"
-    told = [*SETTINGS, f"demos.path={demos}"]
-    killed_runs.finish(
-        request.param, folder.with_name("first"), told
-    )  # the first one loads what others find loaded
-    return request.param, told, folder, killed_runs.finish(request.param, folder, told)
+def whole(request, kind, tmp_path_factory):
+    """The algorithm, what it is told, a run that nothing disturbed, and the seconds that it can be killed in."""
+    folder, (told, since, until) = tmp_path_factory.mktemp(request.param) / "whole", KINDS[kind]
+    told = [*SHARED, *told]
+    killed_runs.finish(request.param, folder.with_name("first"), told)  # loads what others find loaded
+    seconds = killed_runs.finish(request.param, folder, told)
+    if since is not None:
+        seconds = (killed_runs.written(folder, until) - killed_runs.written(folder, since)) / 1e9
+    return request.param, told, folder, seconds
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(FIRST, FIRST + RUNS))
-def test_a_killed_run_is_mended_by_the_same_command(whole, number, tmp_path, record_property):
+def test_a_killed_run_is_mended_by_the_same_command(whole, kind, number, tmp_path):
     algorithm, told, undisturbed, seconds = whole
-    draw, folder = random.Random(f"{algorithm} {number}"), tmp_path / "run"
-    times = [draw.uniform(0, seconds) for _ in range(draw.randint(1, 4))]
-    kills = [killed_runs.kill_after(time, algorithm, folder, told) for time in times]
-    record_property("kills", sum(kills))
-    print(f"{algorithm} {number}: killed after {times} s of {seconds:.1f} s: {kills}")
-    killed_runs.finish(algorithm, folder, told)
-    assert_same(folder, undisturbed)
+    since = KINDS[kind][1]
+    draw, folder = random.Random(f"{kind} {algorithm} {number}"), tmp_path / "run"
+    with noted(f"{algorithm}, {kind}", number, seconds) as kills:
+        for time in [draw.uniform(0, seconds) for _ in range(draw.randint(1, 4))]:
+            if killed_runs.kill_after(time, algorithm, folder, told, since):
+                kills.append(("run", time, newest(folder)))
+        killed_runs.finish(algorithm, folder, told)
+        assert_same(folder, undisturbed)
+        assert {path.name for path in tmp_path.iterdir()} <= {"run", "run.log", "torchinductor_root"}
     before = contents(folder)
     killed_runs.finish(algorithm, folder, told)  # whole, it has nothing left to do
     assert contents(folder) == before
 
 
 def assert_same(folder, other):
-    metrics = [pandas.read_csv(path / "metrics.csv").drop(columns="seconds") for path in (folder, other)]
-    pandas.testing.assert_frame_equal(*metrics)
-    for name in ("map.safetensors", "policy.safetensors", "whole.json"):
-        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
-    assert (folder / "video.mp4").stat().st_size > 0
-    assert names(folder) == names(other)  # nothing is left lying about
-
-
-def names(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+    """Nothing differs but what says when it was and how long it took, and nothing is left lying about."""
+    found, wanted = contents(folder), contents(other)
+    assert sorted(found) == sorted(wanted)
+    for name in wanted:
+        if name.endswith("metrics.csv"):
+            tables = [pandas.read_csv(path / name).drop(columns="seconds") for path in (folder, other)]
+            pandas.testing.assert_frame_equal(*tables)
+        elif name.endswith("map.json"):
+            assert json.loads(found[name]) | {"seconds": 0} == json.loads(wanted[name]) | {"seconds": 0}
+        elif name.endswith((".safetensors", "whole.json", ".png", ".mp4")):
+            assert found[name] == wanted[name], name
 
 
 def contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

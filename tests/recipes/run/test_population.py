@@ -108,7 +108,9 @@ def test_beside_others_of_the_same_settings_it_is_the_same_bit_for_bit(algorithm
 
 @pytest.mark.parametrize("where", [pytest.param(200, marks=pytest.mark.slow), 300])
 def test_stopped_it_goes_on_as_if_it_had_not_been(algorithm, where, tmp_path, monkeypatch):
-    learners = of(algorithm, "abc", "algo.total_frames=400")
+    learners = of(
+        algorithm, "abc", "algo.total_frames=400", "evaluation.every=200"
+    )  # and checkpoints between
     whole = populations.train(algorithm, tmp_path / "whole", learners)
     with pytest.raises(KeyboardInterrupt), populations.breaking_off(monkeypatch, where):
         populations.train(algorithm, tmp_path / "stopped", learners)

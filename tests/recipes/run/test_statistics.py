@@ -44,3 +44,22 @@ def test_a_loss_that_is_no_number_ends_the_training() -> None:
     (lost,) = statistics.take()
     assert isinstance(lost, FloatingPointError)
     assert str(lost).startswith("loss_actor is nan: training diverged")
+
+
+@pytest.mark.parametrize("learners", [None, 3])
+def test_counted_apart_by_a_process_and_the_one_that_goes_on_it_is_the_same(learners: int | None) -> None:
+    first = steps([[0.0, 0.0], [1.0, 0.0]], done=[True, False])
+    second = steps([[1.0, 0.0], [1.0, 0.0]], done=[True, True])
+    first["next", "success"][:] = True
+    if learners is not None:
+        first, second = (TensorDict.stack([data] * learners) for data in (first, second))
+    whole, stopped, resumed = (TrainingStatistics(BOUNDS, learners=learners) for _ in range(3))
+    whole.add_steps(first)
+    whole.add_steps(second)
+    stopped.add_steps(first)
+    resumed.load_state_dict(stopped.state_dict())
+    resumed.add_steps(second)
+    rows = resumed.take()
+    assert rows == whole.take()
+    assert len(rows) == (learners or 1)
+    assert rows[0]["train_success"] == pytest.approx(1 / 3)

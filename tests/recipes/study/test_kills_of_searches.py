@@ -1,16 +1,19 @@
 """A search that is killed, or whose workers are, goes on by the same command: every run as if nothing had happened.
 
-The number of searches is in the environment variable ``NHT_KILLED_RUNS``.
+The environment variable ``NHT_KILLED_RUNS`` says how many searches; ``NHT_KILLED_RUNS_FIRST``, from which draw on;
+``NHT_KILLS``, a file for a row of each kill.
 """
 
+import json
 import os
 import random
+import time
 
 import pandas
 import pytest
-from safetensors import safe_open
 
 import killed_searches
+from kill_table import newest, noted
 
 RUNS = int(os.environ.get("NHT_KILLED_RUNS", "1"))
 FIRST = int(os.environ.get("NHT_KILLED_RUNS_FIRST", "0"))
@@ -38,47 +41,55 @@ SETTINGS = [
     "demos.transitions=500",
 ]
 
+KILLED = {"search": "its process", "worker": "Ray's workers"}
+
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A search that nothing disturbed, and its duration in seconds."""
+    """A search that nothing disturbed, when its first run began, and when it ended, in seconds after its start."""
     folder = tmp_path_factory.mktemp("whole") / "search"
-    return folder, killed_searches.finish(folder, SETTINGS)
+    killed_searches.finish(folder.with_name("first"), SETTINGS)  # loads what others find loaded
+    start = time.time()
+    seconds = killed_searches.finish(folder, SETTINGS)
+    return folder, min(file.stat().st_mtime for file in folder.rglob("config.yaml")) - start, seconds
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # starts Ray up to four times
 @pytest.mark.parametrize("number", range(FIRST, FIRST + RUNS))
-def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path, record_property):
-    undisturbed, seconds = whole
+def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path):
+    undisturbed, begins, seconds = whole
     draw, folder = random.Random(f"search {number}"), tmp_path / "search"
-    attacks = [
-        (draw.uniform(0, seconds), draw.choice(["search", "worker"])) for _ in range(draw.randint(1, 3))
-    ]
-    kills = [killed_searches.kill_after(time, victim, folder, SETTINGS) for time, victim in attacks]
-    record_property("kills", sum(kills))
-    print(f"search {number}: (time, victim) {attacks} of {seconds:.1f} s: {kills}")
-    killed_searches.finish(folder, SETTINGS)
+    attacks = []
+    for _ in range(draw.randint(1, 3)):
+        victim = draw.choice(["search", "worker"])  # before the first run no worker has anything to do
+        attacks.append((draw.uniform(0 if victim == "search" else begins, seconds), victim))
+    with noted("search", number, seconds) as kills:
+        for seconds_after, victim in attacks:
+            if killed_searches.kill_after(seconds_after, victim, folder, SETTINGS):
+                kills.append((KILLED[victim], seconds_after, newest(folder)))
+        killed_searches.finish(folder, SETTINGS)
+        assert_same(folder, undisturbed)
+
+
+def assert_same(folder, undisturbed):
     rows = [rows_of(path) for path in (folder, undisturbed)]
     pandas.testing.assert_frame_equal(*rows)
     assert set(rows[0]["status"]) == {"done"}
     for run in undisturbed.glob("search/*/*"):
         mended = folder / run.relative_to(undisturbed)
-        for name in ("policy.safetensors", "whole.json", "outcome.json"):
+        for name in ("map.safetensors", "policy.safetensors", "whole.json"):
             assert (mended / name).read_bytes() == (run / name).read_bytes(), mended / name
-        assert header(mended / "map.safetensors") == header(run / "map.safetensors")
-    assert names(folder) == names(undisturbed)  # nothing is left lying about
-
-
-def header(file):
-    """With a checksum over all weights; its entries stand in an order that differs between processes."""
-    with safe_open(file, framework="pt") as opened:
-        return opened.metadata()
+        outcomes = [json.loads((path / "outcome.json").read_text()) for path in (mended, run)]
+        assert outcomes[0] | {"core_seconds": 0} == outcomes[1] | {"core_seconds": 0}
+    assert sorted(contents(folder)) == sorted(contents(undisturbed))  # nothing is left lying about
 
 
 def rows_of(folder):
-    return pandas.read_csv(folder / "rows.csv", keep_default_na=False).drop(columns="seconds")
+    return pandas.read_csv(folder / "rows.csv", keep_default_na=False).drop(
+        columns=["seconds", "core_seconds"]
+    )
 
 
-def names(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
