@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase, GymEnv
 from nht.envs.foreign import ForeignEnv
 from nht.envs.gymnasium_copies import GymnasiumCopy, InfoReader, NativeCopy, gymnasium_copy
 from nht.envs.outcome import INFO_FLAGS
-from nht.reading import shortened
 
 
 def make_gymnasium(
@@ -82,7 +81,8 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
             "pip install 'gymnasium[mujoco]'."
         ) from error
     except (TypeError, OverflowError) as error:
-        raise ValueError(f"{name} cannot be made with the options {options}: {shortened(error)}.") from error
+        told = str(error)[:200].rstrip(".")
+        raise ValueError(f"{name} cannot be made with the options {options}: {told}.") from error
     copy = gymnasium_copy(env)
     drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
         "render_modes", []

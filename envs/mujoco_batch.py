@@ -21,12 +21,12 @@ from nht.envs.torchrl_internals import WholeSteps, packed
 class BatchedMujocoEnv(WholeSteps):
     """A TorchRL environment of batch size ``[N]`` whose N copies one native call steps together.
 
-    Told to be in groups, its batch size is ``[groups, N / groups]``; below, N stands for both.
+    With ``groups``, its batch size is ``[groups, N / groups]``; below, N stands for both.
 
-    Reads ``"action"`` ``(N, n)``, the actuation; writes the task's observations (float32), ``"reward"`` and the
-    flags ``"done"``, ``"terminated"``, ``"truncated"``, ``"success"``, ``"failure"`` and ``"diverged"``, each
-    ``(N, 1)``. Partial resets touch only the rows that ``"_reset"`` names, partial steps only those that ``"_step"``
-    names: the others show what they showed, with the reward 0.
+    Reads ``"action"`` ``(N, n)``, the actuation; writes the task's observations (float32), ``"reward"`` and the flags
+    ``"done"``, ``"terminated"``, ``"truncated"``, ``"success"``, ``"failure"`` and ``"diverged"``, each ``(N, 1)``.
+    Partial resets touch only the rows that ``"_reset"`` names, partial steps only those that ``"_step"`` names: the
+    others return the same observation again, with the reward 0.
 
     It can be copied and pickled, so that instances can be handed to the workers of collectors; pictures are taken anew.
 

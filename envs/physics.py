@@ -14,7 +14,7 @@ from nht.envs.arrays import Array, Flags, Rows
 class BatchedPhysics:
     """N copies of a model, each a row of one state array, advanced together by ``mujoco.rollout``.
 
-    It can be copied and pickled: what comes of it goes on bit for bit, on its own.
+    It can be copied and pickled; a copy is independent and goes on bit for bit like the original.
 
     Args:
         model: the compiled model, shared by all copies.
@@ -42,7 +42,7 @@ class BatchedPhysics:
         self._open()
 
     def _open(self) -> None:
-        """Make what belongs to this object alone: views into its arrays, and native memory and threads."""
+        """Create what copies do not share: views into the arrays, and native memory and threads."""
         model = self.model
         # mjSTATE_FULLPHYSICS is laid out as time, qpos, qvel, act, ...
         self.qpos: Array = self.state[:, 1 : 1 + model.nq]

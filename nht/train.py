@@ -25,7 +25,7 @@ Progress = Callable[[dict[str, float]], None]
 
 
 class MapTraining(NamedTuple):
-    """What training gave.
+    """The result of training a map.
 
     Attributes:
         map: the map that was handed in, trained, in eval mode.

@@ -1,4 +1,4 @@
-"""What a map is trained on: context and actuation of demonstrations, and the episodes that are held out."""
+"""The data that a map is trained on: context and actuation of demonstrations, and the held-out episodes."""
 
 from __future__ import annotations
 

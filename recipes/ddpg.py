@@ -33,7 +33,7 @@ from nht.recipes.run.record import Record
 
 
 def main(*configs: DDPG, together: str | None = None) -> None:
-    """Train one learner, or several of one shape at once; evaluate on the way, and say at the end what happened."""
+    """Train one learner, or several of one shape together; evaluate on the way, and print a summary at the end."""
     first = configs[0]
     ranks = Ranks(first.device, seed=first.seed, threads=first.torch_threads, tf32=first.tf32)
     folder = open_run(configs, ranks, together)

@@ -31,7 +31,7 @@ LEARNED_FROM = ("features", "sample", "sample_log_prob", "state_value", "advanta
 
 
 def main(*configs: PPO, together: str | None = None) -> None:
-    """Train one learner, or several of one shape at once; evaluate on the way, and say at the end what happened."""
+    """Train one learner, or several of one shape together; evaluate on the way, and print a summary at the end."""
     first = configs[0]
     ranks = Ranks(first.device, seed=first.seed, threads=first.torch_threads, tf32=first.tf32)
     folder = open_run(configs, ranks, together)
@@ -101,7 +101,7 @@ def descend(
     max_grad_norm: Setting,
     ranks: Ranks,
 ) -> TensorDictBase:
-    """One gradient step, on the minibatches ``(B,)`` of all ranks as if they were one; the losses."""
+    """One gradient step on the minibatches ``(B,)`` of all ranks as if they were one; returns the losses."""
     losses = loss(batch)
     losses["loss"].sum().backward()
     ranks.average_gradients(loss.parameters())

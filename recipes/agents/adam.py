@@ -12,7 +12,7 @@ from nht.recipes.agents.settings import Setting, beside, largest
 
 
 class LearnersAdam(torch.optim.Adam):
-    """``torch.optim.Adam`` over parameters of one learner, or over ``(L, ...)`` of several.
+    """``torch.optim.Adam`` over the parameters of one learner, or over stacked parameters ``(L, ...)`` of several.
 
     Adam moves a parameter by the learning rate times something that does not depend on it. Where learners have rates of
     their own, Adam with a rate of 1 therefore moves a zero, and each learner's part of that, times its own rate, is
@@ -42,7 +42,7 @@ class LearnersAdam(torch.optim.Adam):
         self._rates = [float(group["lr"]) for group in self.param_groups]
 
     def decay(self, share: float) -> None:
-        """Let every learning rate be this share of what it began as."""
+        """Set every learning rate to this share of its initial value."""
         for group, rate in zip(self.param_groups, self._rates, strict=True):
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate * share)
@@ -67,7 +67,7 @@ class LearnersAdam(torch.optim.Adam):
 
 
 def clip_gradients(parameters: Sequence[nn.Parameter], norm: Setting, learners: int | None) -> None:
-    """Shorten a longer gradient to ``norm``: that of one learner, or of each of several, parameters ``(L, ...)``."""
+    """Clip the gradient to ``norm``, for one learner, or for each of several with parameters ``(L, ...)``."""
     if learners is None:
         nn.utils.clip_grad_norm_(parameters, largest(norm))
         return

@@ -87,7 +87,7 @@ def networks(env: EnvBase, algo: DDPGConfig) -> tuple[TensorDictModule, TensorDi
 
 
 class PaperDDPGLoss(DDPGLoss):
-    """``DDPGLoss`` with both target networks, targets clipped if asked for, and an actor that pays for large actions.
+    """``DDPGLoss`` with both target networks, targets clipped if asked for, and an actor penalty on large actions.
 
     Parameters, targets and their updaters are TorchRL's. The networks are called as they are, where TorchRL puts
     parameters into one module before every call: that costs a third of an update of networks as small as ours.

@@ -1,4 +1,4 @@
-"""Normalisers of observations and rewards, which follow what they are shown."""
+"""Normalisers of observations and rewards, with running statistics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def alone(values: Tensor) -> Tensor:
 
 
 class RunningNorm(nn.Module):
-    """Normalises by the mean and deviation of everything it was shown, and clips.
+    """Normalises by the mean and deviation of all data so far, and clips.
 
     Unlike TorchRL's ``VecNorm`` it stands before the networks instead of in the environment, so that the replay
     buffer holds raw observations and old ones are normalised by today's statistics.
@@ -29,7 +29,8 @@ class RunningNorm(nn.Module):
         size: width of the observation.
         clip: largest absolute value put out.
         floor: smallest deviation divided by.
-        learners: that each have statistics of their own; observations are then ``(learners, *batch, size)``.
+        learners: number of learners with separate statistics, if several: observations are ``(learners, *batch,
+            size)``.
     """
 
     count: Tensor
@@ -79,7 +80,7 @@ class RunningNorm(nn.Module):
         return ((observation - shift) / scale).clamp(-self.clip, self.clip)
 
     def spread(self, values: Tensor, observation: Tensor) -> Tensor:
-        """Statistics ``(*learners, size)`` in the shape in which they go with observations."""
+        """Statistics ``(*learners, size)`` in a shape that broadcasts with observations."""
         return values.view(*self.count.shape, *[1] * (observation.ndim - values.ndim), values.shape[-1])
 
 

@@ -1,4 +1,4 @@
-"""What algorithms that learn from a replay buffer share: settings, exploration, the buffer, a gradient step."""
+"""Parts that algorithms with a replay buffer share: settings, exploration, the buffer, a gradient step."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STORED = (
     ("next", "terminated"),
     "steps_to_next_obs",
 )
-"""What the buffer keeps of a step: all that a loss needs once observations are normalised."""
+"""The entries of a step that the buffer keeps: all that a loss needs, with raw observations."""
 
 
 @dataclass
@@ -87,9 +87,9 @@ def replay_buffer(size: int, device: torch.device) -> TensorDictReplayBuffer:
 
 
 def storable(steps: TensorDictBase) -> TensorDictBase:
-    """What the buffer keeps of collected steps ``(copies, T)``: rows, without those whose action is not finite.
+    """Rows for the buffer from collected steps ``(copies, T)``, without those whose action is not finite.
 
-    Of several learners, ``(L, copies, T)``, a row is a step of each, ``(rows, L)``: one that diverged keeps its own.
+    For several learners, ``(L, copies, T)``, a row holds a step of each, ``(rows, L)``, also of learners that diverged.
     """
     if steps.ndim == 3:
         return steps.select(*STORED).flatten(1, 2).transpose(0, 1)
@@ -183,7 +183,7 @@ class Exploration(Protocol):
 
     @property
     def noise_memory(self) -> Setting:
-        """Steps after which the noise has forgotten itself; 1 is white noise."""
+        """Correlation time of the noise in steps; 1 is white noise."""
 
     @property
     def random_action(self) -> Setting:

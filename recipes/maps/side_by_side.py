@@ -12,14 +12,14 @@ from torch.func import functional_call, stack_module_state, vmap
 import nht
 
 FOR_TRAINING = ("seed", "lipschitz", "lipschitz_norm", "start", "beta_kl", "beta_dynamics")
-"""Arguments of maps that matter no more once they are trained."""
+"""Arguments of maps that have no effect after training."""
 
 Group = tuple[list[int], nn.Module, dict[str, Tensor], dict[str, Tensor]]
-"""Places of maps of one shape, one of them, and all their parameters and buffers, each ``(maps, ...)``."""
+"""Indices of maps of one shape, one of the maps, and their stacked parameters and buffers, each ``(maps, ...)``."""
 
 
 class MapsSideBySide(nht.ActionMap):
-    """Maps whose actions, contexts and actuations are as wide: row l of the first dimension goes through map l.
+    """Maps of equal widths, applied together: row l of the first dimension goes through map l.
 
     Maps of one class and the same arguments, but for those of their training, are one call; the same map for all is not
     even stacked.
@@ -111,7 +111,7 @@ def _of_member(values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def grouped(maps: Sequence[nn.Module]) -> list[Group]:
-    """Maps of one shape together; what is the same in all of a group is not stacked."""
+    """Groups of maps of one shape; tensors that all maps of a group share are not stacked."""
     places: dict[str, list[int]] = {}
     for place, map in enumerate(maps):
         places.setdefault(_shape(map), []).append(place)
@@ -126,7 +126,7 @@ def grouped(maps: Sequence[nn.Module]) -> list[Group]:
 
 
 def _shape(map: nn.Module) -> str:
-    """Alike for maps whose computations differ in nothing but their numbers."""
+    """A key that is equal for maps whose computations differ only in their numbers."""
     assert isinstance(map, nht.ActionMap)
     arguments = map.init_args()
     told = {name: value for name, value in arguments.items() if name not in (*FOR_TRAINING, "map")}

@@ -22,7 +22,7 @@ class MakeEnv(Protocol):
     """Makes environments whose policy acts in [-1, 1]^k."""
 
     def __call__(self, *, seed: int | Sequence[int]) -> TransformedEnv:
-        """Those with random draws from ``seed``; from several, those of as many learners."""
+        """Environments seeded by ``seed``; several seeds give those of as many learners."""
 
 
 def make_collector(
@@ -43,8 +43,8 @@ def make_collector(
         make_env: makes more of them, in the workers.
         policy: what acts, exploration included. Workers get its weights when ``update_policy_weights_`` is called.
         frames_per_batch: of all workers together (sync), of the one that is ready first (async).
-        seed: that the workers' seeds come from.
-        random_frames: the first ones, whose actions are uniform.
+        seed: from which the workers' seeds are derived.
+        random_frames: number of steps at the start with uniform actions.
     """
     settings = {
         "frames_per_batch": frames_per_batch,
@@ -65,14 +65,14 @@ def make_collector(
 
 
 def batch_copies(collector: BaseCollector, copies: int) -> slice:
-    """Which of a learner's copies made the latest batch: all, or the ``copies`` of one worker."""
+    """The copies of a learner that the latest batch comes from: all, or the ``copies`` of one worker."""
     if not isinstance(collector, FirstComeCollector):
         return slice(None)
     return slice(collector.latest * copies, (collector.latest + 1) * copies)
 
 
 def worker_seed(seed: int, *place: int) -> int:
-    """A seed for one of several owners of random numbers, by its place among them."""
+    """A seed for one of several users of random numbers, derived from its place among them."""
     return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0])
 
 
@@ -85,7 +85,7 @@ def _in_worker(make_env: MakeEnv, seed: int, parent: int) -> TransformedEnv:
 
 
 class CollectorState:
-    """Where a collector stands between two batches (observation, exploration noise, counted steps), to be checkpointed.
+    """The state of a collector between two batches, for checkpoints: observation, exploration noise, counted steps.
 
     Workers keep theirs to themselves, and so do simulators that cannot be saved: they go on with new episodes, on seeds
     that follow from how far the run has come.
@@ -101,7 +101,7 @@ class CollectorState:
         self._exact = exact and isinstance(collector, Collector)
 
     def state_dict(self) -> dict[str, Any]:
-        """Every entry that the next step starts from, and how many steps were made: the first may be random ones."""
+        """Every entry that the next step starts from, and the number of steps so far."""
         saved: dict[str, Any] = {"frames": counted_frames(self._collector)}
         if self._exact:
             saved["carrier"] = carrier(cast(Collector, self._collector)).to_dict()

@@ -29,7 +29,7 @@ OTHERS = {
     Tensor.multinomial,
     Tensor.random_,
 }
-"""What draws, too, but has no part for each learner: it would make one depend on the others."""
+"""Functions that draw for all learners at once, which would make one learner depend on the others."""
 
 
 class Draws:
@@ -77,7 +77,7 @@ class Draws:
             )
 
     def integers(self, high: int, counts: Sequence[int]) -> list[Tensor]:
-        """For each learner its number of integers below ``high``."""
+        """For each learner its count of random integers below ``high``."""
         return [
             torch.randint(0, high, (count,), generator=generator, device=generator.device)
             for count, generator in zip(counts, self.generators, strict=True)

@@ -1,4 +1,4 @@
-"""Where environments and maps meet."""
+"""Environments driven through action maps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from nht.recipes.sections import EnvConfig, Training
 from nht.transforms import ActionMapTransform
 
 TEST_SEED = 1_000_000
-"""Added to a run's seed, so that test episodes are never those of the training."""
+"""Added to a run's seed for tests, so that test episodes differ from those of training."""
 
 
 def mapped_env(
@@ -132,7 +132,7 @@ class RunEnvs:
 
     @cached_property
     def final_test(self) -> TransformedEnv:
-        """The task to test on at the end, with as many copies as that asks for."""
+        """The task for the test at the end, with one copy for each of its episodes."""
         evaluation = self._config.evaluation
         if evaluation.final_episodes in (None, evaluation.episodes):
             return self.test
@@ -162,7 +162,7 @@ class RunEnvs:
 
 
 def check_env(env: EnvConfig) -> int:
-    """Build one copy of the task and close it again: what is wrong with it shows before anything is written.
+    """Build one copy of the task and close it again, so that errors in it show before anything is written.
 
     Returns:
         the number of motors.

@@ -21,14 +21,13 @@ from nht.recipes.sections import Training
 Config = TypeVar("Config", bound=Training)
 
 OWN = ("seed", "map", "demos", "run.folder", "run.wandb_group", "run.wandb_job_type", "run.wandb_project")
-"""What every learner has of its own, beside what its algorithm says may vary."""
+"""Settings that each learner has of its own, beside those that its algorithm lets vary."""
 
 
 class Learners(Generic[Config]):
     """One learner, whose tensors are as usual, or L of them, whose tensors have a leading dimension ``(L, ...)``.
 
-    What a learner becomes does not depend on who learns beside it: it draws from generators of its own, and no number
-    of one reaches another.
+    Learners are independent: each draws from its own generators, and no number of one reaches another.
 
     Args:
         configs: of each learner.
@@ -70,11 +69,11 @@ class Learners(Generic[Config]):
         return policy if self.draws is None else ExploringApart(policy, self.draws)
 
     def drawing(self) -> AbstractContextManager[Any]:
-        """Within, whatever is drawn is drawn learner by learner."""
+        """Within, every learner draws from its own generator."""
         return nullcontext() if self.draws is None else self.draws.for_all()
 
     def each(self, setting: Setting) -> Any:
-        """A setting of whole numbers as it is, for one learner; as a list, for several."""
+        """An integer setting: a number for one learner, a list for several."""
         if self.count is None:
             return setting
         return setting.tolist() if isinstance(setting, Tensor) else self.count * [setting]
@@ -93,7 +92,7 @@ class ExploringApart(TensorDictSequential):
         self._draws = draws
 
     def forward(self, tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
-        """What the policy does."""
+        """Apply the policy, with each learner's own draws."""
         with self._draws.for_all():
             return super().forward(tensordict, *args, **kwargs)
 
@@ -138,7 +137,7 @@ def check_alike(configs: Sequence[Training]) -> None:
 
 
 def _shared(config: Training) -> dict[str, Any]:
-    """What learners have to share, by dotted names."""
+    """The settings that learners must share, by dotted name."""
     flat = {}
     for section, values in asdict(config).items():
         for name, value in values.items() if isinstance(values, dict) else ((None, values),):

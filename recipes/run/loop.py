@@ -1,4 +1,4 @@
-"""The loop of training around its updates: batches, checkpoints, signals, and what follows the last step."""
+"""The training loop around the updates: batches, checkpoints, signals, and the end of a run."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from nht.recipes.run.workers import WorkerEndedError, Workers
 
 VIDEO_EPISODES = 3
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
-"""What tells a run to end: after a last checkpoint."""
+"""Signals that end a run, after a last checkpoint."""
 ECHO = 3.0
 """Seconds within which a second signal is the first one's echo: ``timeout`` sends it to the process and to its group,
 and torchrun hands it on."""
 
 
 class Loop:
-    """Collects the batches of a run, and saves on the way what it goes on from.
+    """Collects the batches of a run, and writes its checkpoints.
 
     Args:
         folder: of the run.
@@ -48,7 +48,7 @@ class Loop:
         policy: what acts, exploration included.
         loss: whose parameters are trained; all processes start with the first one's.
         learners: whose folders, environments and networks these are, if they may be several.
-        random_frames: the first steps of all processes, whose actions are uniform.
+        random_frames: number of steps of all processes at the start with uniform actions.
         parts: what else the algorithm goes on from, each with a ``state_dict`` and a ``load_state_dict``.
 
     Attributes:
@@ -212,11 +212,11 @@ class Loop:
 
     @property
     def batch_copies(self) -> slice:
-        """Which of this process's copies made the latest batch."""
+        """The copies of this process that the latest batch comes from."""
         return batch_copies(self.collector, self._envs.train.batch_size.numel())
 
     def finish(self, policy: TensorDictModuleBase) -> None:
-        """Save and film the policy of every learner, close everything, and say what happened."""
+        """Save and film the policy of every learner, close everything, and print a summary."""
         folder = self._folder
         for learner, member in folder.finished():
             if self._ranks.first:

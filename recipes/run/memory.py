@@ -1,4 +1,4 @@
-"""What learners need in memory, told before they begin."""
+"""Checks the memory that learners need before they begin."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MEMINFO = Path("/proc/meminfo")
 FLAGS_AND_STEPS = 2 + 8
 """Bytes of a stored step beside its numbers in single precision: two flags, and how many rewards it adds up."""
 SHARE = 0.9
-"""Of what is free: the rest is for networks, environments and whatever else runs."""
+"""Share of the free memory that buffers may take: the rest is for networks, environments and other programs."""
 
 
 def check_memory(configs: Sequence[Training]) -> None:
@@ -33,7 +33,7 @@ def check_memory(configs: Sequence[Training]) -> None:
 
 
 def replay_bytes(config: Training) -> int:
-    """What one learner's replay buffer holds in the end [bytes]; 0 for an algorithm without one."""
+    """Size of one learner's full replay buffer [bytes]; 0 for an algorithm without one."""
     steps = min(getattr(config.algo, "buffer_size", 0), config.algo.total_frames)
     if not steps:
         return 0
@@ -44,7 +44,7 @@ def replay_bytes(config: Training) -> int:
 
 
 def free_bytes(device: str) -> int | None:
-    """What is free on the device [bytes]; None where the system does not say."""
+    """Free memory on the device [bytes]; None where the system does not say."""
     if device.startswith("cuda"):
         return int(torch.cuda.mem_get_info(torch.device(device))[0]) if torch.cuda.is_available() else None
     try:

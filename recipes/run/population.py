@@ -1,4 +1,4 @@
-"""Several learners that train together: a folder for each, as of a run of its own, and one for what they share."""
+"""The folders of learners that train together: one for each, like that of a single run, and one for what they share."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from nht.recipes.sections import Training
 from nht.writing import replacing
 
 DIVERGED_FILE = "diverged.json"
-"""In the folder of a learner that was given up: after how many steps, and why."""
+"""File in the folder of a learner that diverged: after how many steps, and why."""
 
 Row = dict[str, float]
 
@@ -81,7 +81,7 @@ def with_seeds(config: Training) -> list[Training]:
 
 
 class PopulationFolder:
-    """The folders of several learners, to what calls it like that of one.
+    """The folders of several learners, with the interface of the folder of one.
 
     Args:
         configs: of each learner, with folders of their own.
@@ -126,7 +126,7 @@ class PopulationFolder:
 
     @property
     def config(self) -> Training:
-        """What all learners have alike stands in the first one's."""
+        """The first learner's configuration, for the settings that all share."""
         return self.members[0].config
 
     @property
@@ -186,7 +186,7 @@ class PopulationFolder:
         ]
 
     def show(self) -> None:
-        """Say what happened to every learner and where the files are."""
+        """Print the outcome of every learner and where the files are."""
         rows = []
         for member in self.members:
             reason = diverged(member.path)
@@ -203,7 +203,7 @@ class PopulationFolder:
         return str(member.path.relative_to(self.path) if inside else Path(*member.path.parts[-2:]))
 
     def close(self) -> None:
-        """Let go of all folders."""
+        """Release all folders."""
         for member in self.members:
             member.close()
 
@@ -230,7 +230,7 @@ def check_actions(configs: Sequence[Training]) -> None:
 
 
 def diverged(folder: Path) -> str | None:
-    """Why the learner of that folder was given up; None if it was not.
+    """Why the learner of that folder diverged; None if it did not.
 
     Raises:
         ValueError: if the note cannot be read.

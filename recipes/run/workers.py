@@ -1,4 +1,4 @@
-"""The workers of a parallel collector, whose death is noticed wherever TorchRL waits for them."""
+"""Talks to the workers of a parallel collector, and notices their death wherever TorchRL waits for them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchrl.collectors import BaseCollector
 from nht.recipes.torchrl_internals import ended_workers, kill_workers
 
 LOOK_EVERY = 0.2
-"""Seconds between two looks whether all workers live."""
+"""Seconds between two checks whether all workers live."""
 LAG = 2.0
 """Seconds within which a worker whose pipe has broken is seen to have ended."""
 
@@ -54,7 +54,7 @@ class Workers:
         return batch
 
     def update(self, policy: TensorDictModuleBase) -> None:
-        """Give the workers the policy as it is; raises as ``next``."""
+        """Send the workers the current policy; raises as ``next`` does."""
         self._call(lambda: self._collector.update_policy_weights_(policy))
 
     def _call(self, function: Callable[[], Any]) -> Any:

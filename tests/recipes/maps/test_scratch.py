@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from nht.recipes.maps.interface import SCRATCH, train_map
+from nht.recipes.maps.interface import SCRATCH, trained_map
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.writing import OWNED, scratch
 
@@ -23,5 +23,5 @@ def test_what_a_killed_run_recorded_for_its_map_is_removed(
         dead = living.with_name(f".{SCRATCH}.{owner['host']}-{owner['pid']}-1-00000000")
         (dead / "demos").mkdir(parents=True)
         living.mkdir()
-        train_map(MapConfig(kind="svd"), EnvConfig(), DemosConfig(transitions=200), seed=0)
+        trained_map(MapConfig(kind="svd"), EnvConfig(), DemosConfig(transitions=200), seed=0)
         assert list(tmp_path.iterdir()) == [living]

@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
