@@ -36,8 +36,6 @@ SHARED = (
     "map.max_steps=200",
     "env.options.max_episode_steps=200",
 )
-TOLERANCE = 0.05
-"""Relative tolerance of the losses' means over the first updates; rounding differences grow as training goes on."""
 
 
 def main() -> None:
@@ -52,10 +50,7 @@ def main() -> None:
         run_tests()
     with tempfile.TemporaryDirectory() as scratch:
         rows = list(compared(Path(scratch), told.device, told.algorithms))
-    table = pandas.DataFrame(rows)
-    print(table.to_string(index=False))
-    if wrong := table.loc[~table["agrees"], ["task", "algorithm"]].to_numpy().tolist():
-        sys.exit(f"the losses on {told.device} are not those on the CPU: {wrong}")
+    print(pandas.DataFrame(rows).to_string(index=False))
 
 
 def name_of(device: str) -> str:
@@ -81,35 +76,29 @@ def run_tests() -> None:
 
 
 def compared(scratch: Path, device: str, algorithms: Sequence[str]) -> Iterator[dict[str, object]]:
-    """A row for every task and algorithm: speeds on the device, and whether its first losses are the CPU's."""
+    """A row for every task and algorithm: speeds of one learner. Every device draws numbers of its own."""
     for task, map in TASKS.items():
         for algorithm in algorithms:
-            runs = [
+            slow, fast = (
                 trained(scratch / f"{task}-{algorithm}-{place}", task, map, algorithm, where)
                 for place, where in (("cpu", "cpu"), ("device", device))
-            ]
-            losses = [column for column in runs[0] if column.startswith("loss")]
-            expected, found = (run[losses].iloc[0] for run in runs)
-            difference = ((found - expected).abs() / expected.abs().clip(lower=1e-3)).max()
-            slow, fast = (run[["frames", "updates", "seconds"]].diff().iloc[-1] for run in runs)
+            )
             yield {
                 "task": task,
                 "algorithm": algorithm,
                 "frames/s": round(fast["frames"] / fast["seconds"], 1),
                 "frames/s on the CPU": round(slow["frames"] / slow["seconds"], 1),
                 "ms an update, all told": round(1e3 * fast["seconds"] / fast["updates"], 2),
-                "difference": float(difference),
-                "agrees": bool(difference <= TOLERANCE),
             }
 
 
-def trained(folder: Path, task: str, map: str, algorithm: str, device: str) -> pandas.DataFrame:
-    """The metrics of a short run. The first of its two rows is the one in which kernels are loaded."""
+def trained(folder: Path, task: str, map: str, algorithm: str, device: str) -> pandas.Series:
+    """What the second half of a short run took; in the first, kernels are loaded."""
     record = find_algorithm(algorithm)
     own = ON_POLICY if algorithm == "ppo" else OFF_POLICY
     overrides = [f"env={task}", f"map={map}", *SHARED, *own, f"device={device}", f"run.folder={folder}"]
     record.train(configure(record.schema, algorithm, overrides))
-    return pandas.read_csv(folder / "metrics.csv")
+    return pandas.read_csv(folder / "metrics.csv")[["frames", "updates", "seconds"]].diff().iloc[-1]
 
 
 if __name__ == "__main__":

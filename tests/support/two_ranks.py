@@ -55,7 +55,7 @@ class Draws:
         self.ranks, self.generator = ranks, torch.Generator().manual_seed(2)
 
     def __call__(self, like):
-        whole = torch.randn(BATCH, *like.shape[1:], generator=self.generator)
+        whole = torch.randn(BATCH, *like.shape[1:], generator=self.generator).to(like.device)
         return whole.chunk(self.ranks.size)[self.ranks.rank]
 
 
@@ -90,8 +90,8 @@ def batches():
 
 def update(algorithm, ranks):
     """Weights and statistics after the updates."""
-    norm, actor, critic = networks(algorithm)
-    rewards = ReturnNorm(BATCH // ranks.size, gamma=0.9)
+    norm, actor, critic = (module.to(ranks.device) for module in networks(algorithm))
+    rewards = ReturnNorm(BATCH // ranks.size, gamma=0.9).to(ranks.device)
     if algorithm == "ddpg":
         loss = PaperDDPGLoss(actor, critic, gamma=0.9, action_l2=0.1)
     elif algorithm == "td3":
@@ -109,7 +109,7 @@ def update(algorithm, ranks):
     ranks.broadcast(loss)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-2)
     for whole in batches():
-        batch = whole.chunk(ranks.size)[ranks.rank].clone()
+        batch = whole.chunk(ranks.size)[ranks.rank].to(ranks.device).clone()
         norm.module.update(batch["observation"], ranks.sum)
         rewards(batch.unsqueeze(1), add=ranks.sum)
         norm(batch)

@@ -13,6 +13,7 @@ import tiny_runs
 import two_ranks
 from nht.envs import make_env
 from nht.recipes import ppo
+from nht.recipes.agents.adam import LearnersAdam
 from nht.recipes.agents.ddpg import PaperDDPGLoss
 from nht.recipes.agents.norm import ReturnNorm, RunningNorm
 from nht.recipes.agents.off_policy import JointSoftUpdate, descend
@@ -20,6 +21,7 @@ from nht.recipes.agents.ppo import GaussianPPOLoss, estimate_advantages
 from nht.recipes.agents.returns import charge_failure, n_step_returns
 from nht.recipes.agents.sac import DirectSACLoss
 from nht.recipes.agents.td3 import DirectTD3Loss
+from nht.recipes.run.graphs import graphed
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.statistics import TrainingStatistics
 from no_sync import Waits
@@ -71,6 +73,47 @@ def test_an_update_makes_nobody_wait(algorithm):
         statistics.add_losses(update())
     assert waits.found == []
     assert any(not torch.equal(value, before[name]) for name, value in loss.state_dict().items())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
+def test_updates_on_a_gpu_are_those_on_the_cpu(algorithm):
+    on_gpu, on_cpu = (two_ranks.update(algorithm, Ranks(device)) for device in ("cuda", "cpu"))
+    for found, expected in zip(on_gpu, on_cpu, strict=True):
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_an_update_played_from_a_graph_is_the_update():
+    def weights(decorate):
+        ranks = Ranks("cuda")
+        _, actor, critic = (module.to("cuda") for module in two_ranks.networks("ddpg"))
+        loss = PaperDDPGLoss(actor, critic, gamma=0.9, action_l2=0.1)
+        groups = [(loss.actor_network_params.values(True, True), 1e-3)]
+        optimiser = LearnersAdam([*groups, (loss.value_network_params.values(True, True), 1e-2)])
+
+        @decorate(ranks)
+        def update(batch):
+            losses = loss(batch)
+            descend([losses["loss_actor"], losses["loss_value"]], optimiser, ranks)
+            return losses.detach()
+
+        for whole in two_ranks.batches():
+            batch = whole.to("cuda")
+            batch["features"], batch["next", "features"] = batch["observation"], batch["next", "observation"]
+            update(batch)
+        return loss.state_dict()
+
+    graphed_weights, expected = weights(graphed), weights(lambda ranks: lambda update: update)
+    for name, value in expected.items():
+        torch.testing.assert_close(graphed_weights[name], value, rtol=1e-4, atol=1e-5)
+
+
+def test_on_a_cpu_an_update_stays_as_it_is():
+    def update(batch):
+        return batch
+
+    assert graphed(Ranks())(update) is update
 
 
 @pytest.mark.parametrize("algorithm", ["ddpg", "ppo"])  # TorchRL's others cannot be made there
