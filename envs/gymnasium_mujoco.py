@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
+from textwrap import shorten
 from typing import Any
 
 import gymnasium
@@ -15,7 +16,6 @@ from torchrl.envs import EnvBase, GymEnv
 from nht.envs.flat_env import FLAGS
 from nht.envs.foreign import ForeignEnv
 from nht.envs.gymnasium_copies import GymnasiumCopy, InfoReader, NativeCopy, gymnasium_copy
-from nht.reading import shortened
 
 
 def make_gymnasium(
@@ -82,7 +82,9 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
             "pip install 'gymnasium[mujoco]'."
         ) from error
     except (TypeError, OverflowError) as error:
-        raise ValueError(f"{name} cannot be made with the options {options}: {shortened(error)}.") from error
+        raise ValueError(
+            f"{name} cannot be made with the options {options}: {shorten(str(error), 300)}"
+        ) from error
     copy = gymnasium_copy(env)
     drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
         "render_modes", []

@@ -62,12 +62,13 @@ def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path):
     draw, folder = random.Random(f"search {number}"), tmp_path / "search"
     attacks = []
     for _ in range(draw.randint(1, 3)):
-        victim = draw.choice(["search", "worker"])  # before the first run no worker has anything to do
-        attacks.append((draw.uniform(0 if victim == "search" else begins, seconds), victim))
+        victim = draw.choice(["search", "worker"])
+        training = victim == "worker" or draw.random() < 0.5  # workers have nothing to do before
+        attacks.append((draw.uniform(0, seconds - begins if training else begins), victim, training))
     with noted("search", number, seconds) as kills:
-        for seconds_after, victim in attacks:
-            if killed_searches.kill_after(seconds_after, victim, folder, SETTINGS):
-                kills.append((KILLED[victim], seconds_after, newest(folder)))
+        for at, victim, training in attacks:
+            if killed_searches.kill_after(at, victim, folder, SETTINGS, training):
+                kills.append((KILLED[victim], at + begins * training, newest(folder)))
         killed_searches.finish(folder, SETTINGS)
         assert_same(folder, undisturbed)
 
