@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
+from textwrap import shorten
 from typing import Any
 
 import gymnasium
@@ -83,6 +84,9 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
     except (TypeError, OverflowError) as error:
         told = str(error)[:200].rstrip(".")
         raise ValueError(f"{name} cannot be made with the options {options}: {told}.") from error
+        raise ValueError(
+            f"{name} cannot be made with the options {options}: {shorten(str(error), 300)}"
+        ) from error
     copy = gymnasium_copy(env)
     drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
         "render_modes", []

@@ -38,12 +38,22 @@ def finish(folder, overrides):
     return time.monotonic() - began
 
 
-def kill_after(seconds, victim, folder, overrides):
+def kill_after(seconds, victim, folder, overrides, training):
     """Kill the ``search``, or once all processes of Ray's that work for it; whether there was anything to kill.
 
     Nobody is waited for: what the search has started may outlive it for a while.
+
+    Args:
+        seconds: after its start, or, if ``training``, after a run has begun or gone on.
+        victim: ``"search"`` or ``"worker"``.
+        folder: of the search.
+        overrides: that it is told.
+        training: whether runs are to be at it.
     """
+    before = killed_runs.written(folder, "train.log")
     process = start(folder, overrides)
+    while training and process.is_alive() and killed_runs.written(folder, "train.log") == before:
+        time.sleep(0.02)
     process.join(seconds)
     if not process.is_alive():
         return False

@@ -55,7 +55,7 @@ def test_a_killed_run_is_mended_by_the_same_command(whole, kind, number, tmp_pat
     with noted(f"{algorithm}, {kind}", number, seconds) as kills:
         for time in [draw.uniform(0, seconds) for _ in range(draw.randint(1, 4))]:
             if killed_runs.kill_after(time, algorithm, folder, told, since):
-                kills.append(("run", time, newest(folder)))
+                kills.append(("its process", time, newest(folder)))
         killed_runs.finish(algorithm, folder, told)
         assert_same(folder, undisturbed)
         assert {path.name for path in tmp_path.iterdir()} <= {"run", "run.log", "torchinductor_root"}

@@ -41,34 +41,43 @@ SETTINGS = [
     "demos.transitions=500",
 ]
 
+KINDS = {"search": [], "search in packs": ["search.seeds=2", "search.learners=2"]}
 KILLED = {"search": "its process", "worker": "Ray's workers"}
 
 
+@pytest.fixture(scope="module", params=KINDS)
+def kind(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def whole(kind, tmp_path_factory):
     """A search that nothing disturbed, when its first run began, and when it ended, in seconds after its start."""
+    told = [*SETTINGS, *KINDS[kind]]
     folder = tmp_path_factory.mktemp("whole") / "search"
-    killed_searches.finish(folder.with_name("first"), SETTINGS)  # loads what others find loaded
+    killed_searches.finish(folder.with_name("first"), told)  # loads what others find loaded
     start = time.time()
-    seconds = killed_searches.finish(folder, SETTINGS)
+    seconds = killed_searches.finish(folder, told)
     return folder, min(file.stat().st_mtime for file in folder.rglob("config.yaml")) - start, seconds
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # starts Ray up to four times
 @pytest.mark.parametrize("number", range(FIRST, FIRST + RUNS))
-def test_a_killed_search_is_mended_by_the_same_command(whole, number, tmp_path):
+def test_a_killed_search_is_mended_by_the_same_command(kind, whole, number, tmp_path):
     undisturbed, begins, seconds = whole
-    draw, folder = random.Random(f"search {number}"), tmp_path / "search"
+    told = [*SETTINGS, *KINDS[kind]]
+    draw, folder = random.Random(f"{kind} {number}"), tmp_path / "search"
     attacks = []
     for _ in range(draw.randint(1, 3)):
-        victim = draw.choice(["search", "worker"])  # before the first run no worker has anything to do
-        attacks.append((draw.uniform(0 if victim == "search" else begins, seconds), victim))
-    with noted("search", number, seconds) as kills:
-        for seconds_after, victim in attacks:
-            if killed_searches.kill_after(seconds_after, victim, folder, SETTINGS):
-                kills.append((KILLED[victim], seconds_after, newest(folder)))
-        killed_searches.finish(folder, SETTINGS)
+        victim = draw.choice(["search", "worker"])
+        training = victim == "worker" or draw.random() < 0.5  # workers have nothing to do before
+        attacks.append((draw.uniform(0, seconds - begins if training else begins), victim, training))
+    with noted(kind, number, seconds) as kills:
+        for at, victim, training in attacks:
+            if killed_searches.kill_after(at, victim, folder, told, training):
+                kills.append((KILLED[victim], at + begins * training, newest(folder)))
+        killed_searches.finish(folder, told)
         assert_same(folder, undisturbed)
 
 
@@ -82,7 +91,7 @@ def assert_same(folder, undisturbed):
             assert (mended / name).read_bytes() == (run / name).read_bytes(), mended / name
         outcomes = [json.loads((path / "outcome.json").read_text()) for path in (mended, run)]
         assert outcomes[0] | {"core_seconds": 0} == outcomes[1] | {"core_seconds": 0}
-    assert sorted(contents(folder)) == sorted(contents(undisturbed))  # nothing is left lying about
+    assert names(folder) == names(undisturbed)  # nothing is left lying about
 
 
 def rows_of(folder):
@@ -91,5 +100,7 @@ def rows_of(folder):
     )
 
 
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+def names(folder):
+    """All but what runs have said, which they say where they are trained: beside others, or alone."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != "train.log")
+    return sorted(str(path.relative_to(folder)) for path in files)
