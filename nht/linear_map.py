@@ -85,7 +85,7 @@ class LinearActionMap(ActionMap):
         """An actuation (*batch, n) less u0(c): its way from rest."""
         return actuation if self.offset_model is None else actuation - self.offset_model(context)
 
-    def offset_loss(self, way: Tensor) -> Tensor | float:
+    def offset_losses(self, way: Tensor) -> Tensor | float:
         """What a contextual u0 is trained by, beside the loss: |u - u0(c)|^2, in its gradient but not in its value.
 
         The loss asks nothing of u0 within the span of Q(c), where an action does as much. Whatever Q(c) is, the mean of
@@ -93,8 +93,11 @@ class LinearActionMap(ActionMap):
 
         Args:
             way: u - u0(c), (batch, n).
+
+        Returns:
+            That of each transition, (batch,).
         """
         if not isinstance(self.offset_model, NetworkOffset):
             return 0.0
-        pull = way.square().sum(-1).mean()
+        pull = way.square().sum(-1)
         return pull - pull.detach()

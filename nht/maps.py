@@ -117,10 +117,14 @@ class NHT(LinearActionMap):
         return householder_coordinates(self.reflectors(context), way)[..., : self.action_dim]
 
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """The mean of |u - Q Q^T u|^2 (Eq. 6), u measured from u0(c), read off the last n - k coordinates of u."""
+        """The mean of |u - Q Q^T u|^2 (Eq. 6), u measured from u0(c)."""
+        return self.losses(batch).mean()
+
+    def losses(self, batch: TensorDictBase) -> Tensor:
+        """The loss of each transition, (batch,), read off the last n - k coordinates of u."""
         way = self.to_rest(batch["actuation"], batch["context"])
         coordinates = householder_coordinates(self.reflectors(batch["context"]), way)
-        return coordinates[..., self.action_dim :].square().sum(-1).mean() + self.offset_loss(way)
+        return coordinates[..., self.action_dim :].square().sum(-1) + self.offset_losses(way)
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:

@@ -1,0 +1,143 @@
+"""Networks of several maps, each on rows of its own: what they give, and their gradients, in few calls.
+
+Rows of all maps stand one behind another. A layer is a matrix product for each network, of the very shape that it has
+alone; all else, activations and their slopes, is one call for all networks of one depth and activation. So nothing is
+padded, whatever the widths and batch sizes, and no network sees another's numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise, starmap
+
+import torch
+from torch import Tensor
+
+from nht.networks import ContextNetwork
+from nht.offset import ConstantOffset
+
+SLOPES: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": lambda value: value.sign(),
+    "sigmoid": lambda value: (1 - value).mul_(value),
+    "tanh": lambda value: 1 - value.square(),
+}
+"""The slope of an activation, from what it gave."""
+
+
+class NetworksTogether:
+    """Several context networks, of any widths, depths and activations, with one linear layer after another.
+
+    Weights and gradients are the networks' own: ``backward`` writes to ``parameter.grad``, which must be there.
+
+    Args:
+        networks: of one input and output width, on one device.
+        rows: how many rows belong to each.
+    """
+
+    def __init__(self, networks: Sequence[ContextNetwork], rows: Sequence[int]) -> None:
+        like = networks[0].context_mean
+        count, width = sum(rows), networks[0].linear(-1).bias.numel()
+        self._mean = torch.cat([net.context_mean.expand(n, -1) for net, n in zip(networks, rows, strict=True)])
+        self._std = torch.cat([net.context_std.expand(n, -1) for net, n in zip(networks, rows, strict=True)])
+        self._inputs = like.new_empty(count, len(like))
+        self._output, self._gradient = like.new_empty(count, width), like.new_empty(count, width)
+        alike: dict[tuple[int, str], list[int]] = {}
+        for place, network in enumerate(networks):
+            alike.setdefault((len(network.layers), network.activation), []).append(place)
+        shares = [values.split(list(rows)) for values in (self._inputs, self._output, self._gradient)]
+        self._stacks = [
+            _Stack([networks[place] for place in places], *([share[place] for place in places] for share in shares))
+            for places in alike.values()
+        ]
+
+    @torch.no_grad()
+    def forward(self, context: Tensor) -> Tensor:
+        """Map contexts (rows, context_dim) to outputs (rows, output_dim), in memory that the next call writes again."""
+        torch.sub(context, self._mean, out=self._inputs).div_(self._std)
+        for stack in self._stacks:
+            stack.forward()
+        return self._output
+
+    @torch.no_grad()
+    def backward(self, gradient: Tensor) -> None:
+        """From the gradient of the last outputs, (rows, output_dim), to those of all weights."""
+        self._gradient.copy_(gradient)
+        for stack in self._stacks:
+            stack.backward()
+
+
+class ConstantsTogether:
+    """Constant offsets of several maps, to what calls them like ``NetworksTogether``."""
+
+    def __init__(self, offsets: Sequence[ConstantOffset], rows: Sequence[int]) -> None:
+        self._values = [offset.value.detach() for offset in offsets]
+        self._gradients = [offset.value.grad for offset in offsets]
+        self._rows = list(rows)
+
+    @torch.no_grad()
+    def forward(self, context: Tensor) -> Tensor:
+        """The offset of each row, (rows, n)."""
+        return torch.cat([value.expand(n, -1) for value, n in zip(self._values, self._rows, strict=True)])
+
+    @torch.no_grad()
+    def backward(self, gradient: Tensor) -> None:
+        """From the gradient of the last outputs, (rows, n), to those of all offsets."""
+        for share, own in zip(gradient.split(self._rows), self._gradients, strict=True):
+            torch.sum(share, 0, out=own)
+
+
+class _Stack:
+    """Networks of one depth and activation. All memory is laid out once, and so are the calls.
+
+    Args:
+        networks: the networks.
+        inputs: where the rows of each stand.
+        outputs: where what each gives is to stand.
+        gradients: where the gradient of that will stand.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[ContextNetwork],
+        inputs: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        gradients: Sequence[Tensor],
+    ) -> None:
+        self._activate_ = getattr(torch, f"{networks[0].activation}_")  # in place
+        self._slope = SLOPES[networks[0].activation]
+        self._hidden: list[Tensor] = []  # of every layer the values of all networks, one behind another
+        self._hidden_gradients: list[Tensor] = []
+        values, slopes = [inputs], [inputs]  # of every layer a matrix for each network; inputs need no gradient
+        for index in range(len(networks[0].layers) - 1):
+            shapes = [(len(rows), len(net.linear(index).bias)) for net, rows in zip(networks, inputs, strict=True)]
+            for flats, layers in ((self._hidden, values), (self._hidden_gradients, slopes)):
+                flats.append(inputs[0].new_empty(sum(starmap(int.__mul__, shapes))))
+                parts = flats[-1].split(list(starmap(int.__mul__, shapes)))
+                layers.append([part.view(shape) for part, shape in zip(parts, shapes, strict=True)])
+        values, slopes = [*values, outputs], [*slopes, gradients]
+        self._products, self._weight_gradients, self._input_gradients = [], [], []
+        for index, ((before, after), (below, above)) in enumerate(zip(pairwise(values), pairwise(slopes), strict=True)):
+            layers = [network.linear(index) for network in networks]
+            weights = [layer.weight.detach() for layer in layers]
+            biases = [layer.bias.detach() for layer in layers]
+            own = [(layer.weight.grad, layer.bias.grad) for layer in layers]
+            self._products.append(list(zip(biases, before, [weight.mT for weight in weights], after, strict=True)))
+            self._weight_gradients.append(list(zip(above, [part.mT for part in above], before, own, strict=True)))
+            self._input_gradients.append(list(zip(above, weights, below, strict=True)))
+
+    def forward(self) -> None:
+        for products, hidden in zip(self._products, [*self._hidden, None], strict=True):
+            for bias, value, matrix, result in products:
+                torch.addmm(bias, value, matrix, out=result)
+            if hidden is not None:
+                self._activate_(hidden)
+
+    def backward(self) -> None:
+        for index in reversed(range(len(self._products))):
+            for gradient, turned, value, (weight, bias) in self._weight_gradients[index]:
+                torch.mm(turned, value, out=weight)
+                torch.sum(gradient, 0, out=bias)
+            if index:
+                for gradient, matrix, result in self._input_gradients[index]:
+                    torch.mm(gradient, matrix, out=result)
+                self._hidden_gradients[index - 1].mul_(self._slope(self._hidden[index - 1]))
