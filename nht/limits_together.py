@@ -13,8 +13,8 @@ from nht.lipschitz import LipschitzProjection
 class LimitsTogether:
     """What ``LipschitzProjection.step`` does to each of several maps.
 
-    The directions of all matrices are rows of one table, filled up with zeros, which change no norm: only the products
-    with a matrix are a call each.
+    Products and norms are a call each, of the shape that they have alone; what is done to directions is done to those of
+    all matrices at once, in a table whose rows are filled up with zeros.
 
     Args:
         limits: of the maps, on one device.
@@ -24,7 +24,7 @@ class LimitsTogether:
         networks = [network for limit in limits for network in limit.networks]
         self._apart = [network for network in networks if network.frobenius]
         self._followed = [network for network in networks if not network.frobenius]
-        self._products: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
+        self._products: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]] = []
         if self._followed:
             self._lay_out()
 
@@ -47,16 +47,18 @@ class LimitsTogether:
                 matrix = torch.empty_like(weight)
                 self._divisions.append((weight, std, matrix))
             self._matrices.append(matrix)
-        shares = list(zip(self._matrices, self._directions, self._images, self._moves, strict=True))
-        self._products = [
-            (m, m.mT, d[: m.shape[1], None], i[: m.shape[0], None], r[: m.shape[1], None]) for m, d, i, r in shares
-        ]
+        self._lengths = like.new_zeros(count, 1)
+        tables = (self._directions, self._images, self._moves, self._lengths)
+        for matrix, direction, image, move, length in zip(self._matrices, *tables, strict=True):
+            high, wide = matrix.shape
+            columns = direction[:wide, None], image[:high, None], move[:wide, None], length[:, None]
+            self._products.append((matrix, matrix.mT, *columns))
         self.follow()
 
     def follow(self) -> None:
         """After ``LipschitzProjection.exact``: go on from the directions that it found."""
         found = [direction for network in self._followed for direction in network.directions]
-        for direction, (_, _, own, _, _) in zip(found, self._products, strict=True):
+        for direction, (_, _, own, *_) in zip(found, self._products, strict=True):
             own.copy_(direction)
 
     @torch.no_grad()
@@ -68,15 +70,18 @@ class LimitsTogether:
             return
         for weight, std, matrix in self._divisions:
             torch.div(weight, std, out=matrix)
-        for matrix, turned, direction, image, move in self._products:
+        for matrix, turned, direction, image, move, length in self._products:
             torch.mm(matrix, direction, out=image)
             torch.mm(turned, image, out=move)
-        length = torch.linalg.vector_norm(self._moves, dim=1, keepdim=True)
+            torch.linalg.vector_norm(move, dim=-2, keepdim=True, out=length)
+        length = self._lengths
         # A matrix of zeros, as the last one is at the start, has no direction to follow yet.
         self._directions.copy_(torch.where(length > 0, self._moves / length.clamp_min(1e-12), self._directions))
-        for matrix, _, direction, image, _ in self._products:
+        for matrix, _, direction, image, _, length in self._products:
             torch.mm(matrix, direction, out=image)
-        factors = (self._limits / torch.linalg.vector_norm(self._images, dim=1)).clamp_max(1)
+            torch.linalg.vector_norm(image, dim=-2, keepdim=True, out=length)
+        # A number over a tensor is rounded twice, too.
+        factors = (self._lengths.squeeze(1).reciprocal() * self._limits).clamp_max(1)
         for weight, factor, less in zip(self._weights, factors, self._shortened(factors), strict=True):
             if less:
                 weight.mul_(factor)

@@ -110,8 +110,7 @@ class _Training:
 
     Attributes:
         place: among the maps.
-        map: whose parameters are parts of ``weights``.
-        weights: all of them one behind another, as one parameter, with its gradient.
+        map: with memory for its gradients.
         held_out: (T,), true where training does not look.
         rows: the numbers of the transitions that it trains on.
         generator: of its batches.
@@ -123,7 +122,6 @@ class _Training:
 
     place: int
     map: NHT | SCL
-    weights: nn.Parameter
     held_out: Tensor
     rows: Tensor
     batch_size: int
@@ -152,10 +150,11 @@ def _begin(
     held_out = split_episodes(demos.episode, validation_share, seed)
     map.train()
     map.fit(data[~held_out])
+    for parameter in map.parameters():
+        parameter.grad = torch.zeros_like(parameter)
     begun = _Training(
         place=place,
         map=map,
-        weights=_joined(map),
         held_out=held_out,
         rows=torch.nonzero(~held_out).squeeze(1),
         batch_size=batch_size,
@@ -171,7 +170,7 @@ def _begin(
 
 def _descend(begun: Sequence[_Training], data: TensorDictBase, progress: ProgressTogether | None) -> None:
     """Take gradient steps until every map is done; those that are leave the others' calls."""
-    optimiser = torch.optim.Adam([{"params": [one.weights]} for one in begun], fused=True)
+    optimiser = torch.optim.Adam([{"params": list(one.map.parameters())} for one in begun], fused=True)
     going_on, step, steps = list(begun), 0, None
     while going_on:
         start = time.perf_counter()
@@ -288,31 +287,13 @@ class _Given(nn.Module):
 def _result(
     one: _Training, demos: Demos, keys: tuple[NestedKey, ...], data: TensorDictBase
 ) -> MapTraining | FloatingPointError:
-    _part(one.map)
+    one.map.zero_grad()
     try:
         best_step = one.best.restore()
     except FloatingPointError as error:
         return error
     told = {"steps": one.best.steps, "best_step": best_step, "seconds": one.seconds}
     return finished(one.map, demos, keys, data, one.held_out, told)
-
-
-def _joined(map: nn.Module) -> nn.Parameter:
-    """All parameters of a map one behind another; they become parts of it, and so do their gradients."""
-    own = list(map.parameters())
-    whole = nn.Parameter(torch.cat([parameter.detach().flatten() for parameter in own]))
-    whole.grad = torch.zeros_like(whole)
-    sizes = [parameter.numel() for parameter in own]
-    for parameter, value, gradient in zip(own, whole.detach().split(sizes), whole.grad.split(sizes), strict=True):
-        shape = parameter.shape
-        parameter.data, parameter.grad = value.view(shape), gradient.view(shape)
-    return whole
-
-
-def _part(map: nn.Module) -> None:
-    """Give every parameter memory of its own again."""
-    for parameter in map.parameters():
-        parameter.data, parameter.grad = parameter.data.clone(), None
 
 
 def cosine(rate: float, steps: int) -> Iterator[float]:
