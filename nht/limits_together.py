@@ -13,8 +13,8 @@ from nht.lipschitz import LipschitzProjection
 class LimitsTogether:
     """What ``LipschitzProjection.step`` does to each of several maps.
 
-    Products and norms are a call each, of the shape that they have alone; what is done to directions is done to those of
-    all matrices at once, in a table whose rows are filled up with zeros.
+    Products and norms are a call each, of the shape that they have alone; what is done to directions is done to those
+    of all matrices at once, in a table whose rows are filled up with zeros.
 
     Args:
         limits: of the maps, on one device.
@@ -37,7 +37,8 @@ class LimitsTogether:
         self._weights = [weight for _, _, weight in weights]
         like, count = self._weights[0], len(weights)
         widest, tallest = (max(weight.shape[side] for weight in self._weights) for side in (1, 0))
-        self._limits = torch.tensor([network.limits[layer] for network, layer, _ in weights]).to(like)
+        limits = [network.limits[layer] for network, layer, _ in weights]
+        self._limits = torch.tensor(limits, dtype=like.dtype, device=like.device)
         self._directions, self._moves = like.new_zeros(count, widest), like.new_zeros(count, widest)
         self._images = like.new_zeros(count, tallest)
         self._matrices, self._divisions = [], []
@@ -76,7 +77,9 @@ class LimitsTogether:
             torch.linalg.vector_norm(move, dim=-2, keepdim=True, out=length)
         length = self._lengths
         # A matrix of zeros, as the last one is at the start, has no direction to follow yet.
-        self._directions.copy_(torch.where(length > 0, self._moves / length.clamp_min(1e-12), self._directions))
+        self._directions.copy_(
+            torch.where(length > 0, self._moves / length.clamp_min(1e-12), self._directions)
+        )
         for matrix, _, direction, image, _, length in self._products:
             torch.mm(matrix, direction, out=image)
             torch.linalg.vector_norm(image, dim=-2, keepdim=True, out=length)

@@ -19,7 +19,9 @@ from nht.offset import ConstantOffset
 BACKWARD: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "relu": lambda gradient, value: gradient.mul_(value.sign()),
     "sigmoid": lambda gradient, value: gradient.mul_(1 - value).mul_(value),
-    "tanh": lambda gradient, value: gradient.mul_(torch.addcmul(torch.ones_like(value), value, value, value=-1)),
+    "tanh": lambda gradient, value: gradient.mul_(
+        torch.addcmul(torch.ones_like(value), value, value, value=-1)
+    ),
 }
 """From the gradient of what an activation gave, and what it gave, to the gradient of its input, in place.
 
@@ -40,7 +42,9 @@ class NetworksTogether:
     def __init__(self, networks: Sequence[ContextNetwork], rows: Sequence[int]) -> None:
         like = networks[0].context_mean
         count, width = sum(rows), networks[0].linear(-1).bias.numel()
-        self._mean = torch.cat([net.context_mean.expand(n, -1) for net, n in zip(networks, rows, strict=True)])
+        self._mean = torch.cat(
+            [net.context_mean.expand(n, -1) for net, n in zip(networks, rows, strict=True)]
+        )
         self._std = torch.cat([net.context_std.expand(n, -1) for net, n in zip(networks, rows, strict=True)])
         self._inputs = like.new_empty(count, len(like))
         self._output, self._gradient = like.new_empty(count, width), like.new_empty(count, width)
@@ -49,7 +53,10 @@ class NetworksTogether:
             alike.setdefault((len(network.layers), network.activation), []).append(place)
         shares = [values.split(list(rows)) for values in (self._inputs, self._output, self._gradient)]
         self._stacks = [
-            _Stack([networks[place] for place in places], *([share[place] for place in places] for share in shares))
+            _Stack(
+                [networks[place] for place in places],
+                *([share[place] for place in places] for share in shares),
+            )
             for places in alike.values()
         ]
 
@@ -110,22 +117,33 @@ class _Stack:
         self._backward_ = BACKWARD[networks[0].activation]
         self._hidden: list[Tensor] = []  # of every layer the values of all networks, one behind another
         self._hidden_gradients: list[Tensor] = []
-        values, slopes = [inputs], [inputs]  # of every layer a matrix for each network; inputs need no gradient
+        values, slopes = (
+            [inputs],
+            [inputs],
+        )  # of every layer a matrix for each network; inputs need no gradient
         for index in range(len(networks[0].layers) - 1):
-            shapes = [(len(rows), len(net.linear(index).bias)) for net, rows in zip(networks, inputs, strict=True)]
+            shapes = [
+                (len(rows), len(net.linear(index).bias)) for net, rows in zip(networks, inputs, strict=True)
+            ]
             for flats, layers in ((self._hidden, values), (self._hidden_gradients, slopes)):
                 flats.append(inputs[0].new_empty(sum(starmap(int.__mul__, shapes))))
                 parts = flats[-1].split(list(starmap(int.__mul__, shapes)))
                 layers.append([part.view(shape) for part, shape in zip(parts, shapes, strict=True)])
         values, slopes = [*values, outputs], [*slopes, gradients]
         self._products, self._weight_gradients, self._input_gradients = [], [], []
-        for index, ((before, after), (below, above)) in enumerate(zip(pairwise(values), pairwise(slopes), strict=True)):
+        for index, ((before, after), (below, above)) in enumerate(
+            zip(pairwise(values), pairwise(slopes), strict=True)
+        ):
             layers = [network.linear(index) for network in networks]
             weights = [layer.weight.detach() for layer in layers]
             biases = [layer.bias.detach() for layer in layers]
             own = [(layer.weight.grad, layer.bias.grad) for layer in layers]
-            self._products.append(list(zip(biases, before, [weight.mT for weight in weights], after, strict=True)))
-            self._weight_gradients.append(list(zip(above, [part.mT for part in above], before, own, strict=True)))
+            self._products.append(
+                list(zip(biases, before, [weight.mT for weight in weights], after, strict=True))
+            )
+            self._weight_gradients.append(
+                list(zip(above, [part.mT for part in above], before, own, strict=True))
+            )
             self._input_gradients.append(list(zip(above, weights, below, strict=True)))
 
     def forward(self) -> None:

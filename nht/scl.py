@@ -72,6 +72,14 @@ class SCL(LinearActionMap):
         """Q(c), any n x k matrix."""
         return self.network(context).unflatten(-1, (self.actuation_dim, self.action_dim))
 
+    def _reconstruct(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """u0(c) + Q(c) Q(c)^+ (u - u0(c)), with the basis computed once."""
+        if type(self) is not SCL:  # a subclass may go another way, there or back
+            return super()._reconstruct(actuation, context)
+        basis = self.basis(context)
+        action = least_squares(basis, self.to_rest(actuation, context))
+        return self.from_rest((basis @ action.unsqueeze(-1)).squeeze(-1), context)
+
     def loss(self, batch: TensorDictBase) -> Tensor:
         """The mean of |u - Q Q^+ u|^2 (Eq. 6), u measured from u0(c)."""
         return self.losses(batch).mean()

@@ -87,7 +87,9 @@ def train_map(
         rounds = _gradient_steps(map, training, batch_size, learning_rate, max_steps, seed)
         steps, best_step = _keep_best(map, validation, rounds, patience, progress)
     seconds = time.perf_counter() - start
-    return finished(map, demos, keys, data, held_out, {"steps": steps, "best_step": best_step, "seconds": seconds})
+    return finished(
+        map, demos, keys, data, held_out, {"steps": steps, "best_step": best_step, "seconds": seconds}
+    )
 
 
 def finished(
@@ -138,7 +140,7 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
     """
     missed = total = 0.0
     for c, u in zip(torch.split(context, CHUNK), torch.split(actuation, CHUNK), strict=True):
-        missed += float((u - map(map.project(u, c), c)).double().square().sum())
+        missed += float((u - map._reconstruct(u, c)).double().square().sum())
         total += float(u.double().square().sum())
     if total == 0:
         raise ValueError("the projection error is relative to the actuations, and these are all zero.")
@@ -240,7 +242,9 @@ class EarlyStopping:
             FloatingPointError: if the loss was not finite when it was looked at first.
         """
         if self._diverged:
-            raise FloatingPointError(f"training diverged in the first {self.steps} steps; lower learning_rate.")
+            raise FloatingPointError(
+                f"training diverged in the first {self.steps} steps; lower learning_rate."
+            )
         self._map.load_state_dict(self._best_weights)
         return self._best_step
 

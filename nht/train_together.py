@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from nht.demos import Demos
 from nht.limits_together import LimitsTogether
-from nht.linear_map import LinearActionMap
 from nht.lipschitz import LipschitzProjection
 from nht.maps import NHT, ActionMap
 from nht.networks_together import ConstantsTogether, NetworksTogether
@@ -27,6 +26,8 @@ from nht.training_data import context_keys_of, split_episodes, training_data
 
 Number = TypeVar("Number", int, float)
 ProgressTogether = Callable[[int, dict[str, float]], None]
+SHARING = (NHT, SCL)
+"""Kinds that share their calls: their losses need no more than what networks of linear layers make of the context."""
 SHARED = ("context_dim", "actuation_dim", "action_dim", "context_keys", "offset")
 """What maps that train together have alike, beside their class, precision and device."""
 
@@ -95,11 +96,13 @@ def train_maps(
     keys = context_keys_of(demos, maps[0], context_keys)
     if not all(_shares_calls(map) for map in maps):
         return [
-            _alone(demos, map, keys, place, progress, numbers)
-            for place, (map, numbers) in enumerate(zip(maps, own, strict=True))
+            _alone(demos, maps[place], keys, place, progress, numbers) for place, numbers in enumerate(own)
         ]
     data = training_data(demos, maps[0], keys)
-    begun = [_begin(place, map, demos, data, **numbers) for place, (map, numbers) in enumerate(zip(maps, own, strict=True))]
+    begun = [
+        _begin(place, map, demos, data, **numbers)
+        for place, (map, numbers) in enumerate(zip(maps, own, strict=True))
+    ]
     _descend(begun, data, progress)
     return [_result(one, demos, keys, data) for one in begun]
 
@@ -221,8 +224,8 @@ class _Steps:
         self._trainings, self._data = trainings, data
         rows = [one.batch_size for one in trainings]
         maps = [one.map for one in trainings]
-        shares = torch.cat([torch.full((count,), 1 / count) for count in rows])  # of a mean of each map's own
-        self._shares = shares.to(data["actuation"])
+        like = data["actuation"]
+        self._shares = torch.cat([like.new_full((count,), 1 / count) for count in rows])  # of each map's mean
         self._rows = rows
         self._map, self._read = copy.deepcopy(maps[0]).requires_grad_(requires_grad=False), []
         self._networks: list[NetworksTogether | ConstantsTogether] = [
@@ -245,7 +248,9 @@ class _Steps:
     def take(self, count: int, optimiser: torch.optim.Optimizer) -> list[float]:
         """Take steps: the loss of each map in the last of them."""
         for index in self._drawn(count):
-            batch = TensorDict({name: self._data[name][index] for name in ("context", "actuation")}, len(index))
+            batch = TensorDict(
+                {name: self._data[name][index] for name in ("context", "actuation")}, len(index)
+            )
             losses = self._losses(batch)
             gradients = torch.autograd.grad(losses @ self._shares, [given.output for given in self._read])
             for networks, gradient in zip(self._networks, gradients, strict=True):
@@ -319,8 +324,7 @@ def _alone(
 
 
 def _shares_calls(map: ActionMap) -> bool:
-    """Whether its losses need no more than its networks' outputs, which are those of plain linear layers."""
-    return type(map) in (NHT, SCL) and not getattr(map, "multi_head", False)
+    return type(map) in SHARING and not getattr(map, "multi_head", False)
 
 
 def _of_each(name: str, value: Number | Sequence[Number], count: int) -> list[Number]:
@@ -341,7 +345,9 @@ def _check_alike(maps: Sequence[ActionMap]) -> None:
                 f"{type(map).__name__}."
             )
         if (twin := seen.setdefault(id(map), place)) != place:
-            raise ValueError(f"map {place} is map {twin} once more: each is trained in place, so give it a twin.")
+            raise ValueError(
+                f"map {place} is map {twin} once more: each is trained in place, so give it a twin."
+            )
         kept, found = _shared(first), _shared(map)
         for name, value in found.items():
             if value != kept[name]:
