@@ -86,7 +86,7 @@ def test_other_kinds_and_offsets_are_trained_apart(tmp_path: Path, demos: Path, 
 
 
 def test_a_map_that_diverges_is_that_runs_failure(tmp_path: Path, demos: Path) -> None:
-    learners = LEARNERS | {"b": [*LEARNERS["b"], "map.learning_rate=.inf"]}
+    learners = LEARNERS | {"b": [*LEARNERS["b"], "map.learning_rate=inf"]}
     with pytest.raises(FloatingPointError, match="training diverged in the first 60 steps"):
         opened(tmp_path, learners, demos)
     assert not any((tmp_path / name).exists() for name in learners)
