@@ -8,7 +8,8 @@ padded, whatever the widths and batch sizes, and no network sees another's numbe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise, starmap
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -117,34 +118,28 @@ class _Stack:
         self._backward_ = BACKWARD[networks[0].activation]
         self._hidden: list[Tensor] = []  # of every layer the values of all networks, one behind another
         self._hidden_gradients: list[Tensor] = []
-        values, slopes = (
-            [inputs],
-            [inputs],
-        )  # of every layer a matrix for each network; inputs need no gradient
+        values, pulls = [inputs], [inputs]  # of each layer a matrix a network; inputs need no gradient
         for index in range(len(networks[0].layers) - 1):
-            shapes = [
-                (len(rows), len(net.linear(index).bias)) for net, rows in zip(networks, inputs, strict=True)
-            ]
-            for flats, layers in ((self._hidden, values), (self._hidden_gradients, slopes)):
-                flats.append(inputs[0].new_empty(sum(starmap(int.__mul__, shapes))))
-                parts = flats[-1].split(list(starmap(int.__mul__, shapes)))
-                layers.append([part.view(shape) for part, shape in zip(parts, shapes, strict=True)])
-        values, slopes = [*values, outputs], [*slopes, gradients]
-        self._products, self._weight_gradients, self._input_gradients = [], [], []
+            widths = [len(network.linear(index).bias) for network in networks]
+            for flats, layers in ((self._hidden, values), (self._hidden_gradients, pulls)):
+                flat, parts = _one_behind_another(inputs, widths)
+                flats.append(flat)
+                layers.append(parts)
+        values, pulls = [*values, outputs], [*pulls, gradients]
+        self._products: list[list[tuple[Tensor, Tensor, Tensor, Tensor]]] = []
+        self._weight_gradients: list[list[tuple[Tensor, Tensor, Tensor, Any, Any]]] = []
+        self._input_gradients: list[list[tuple[Tensor, Tensor, Tensor]]] = []
         for index, ((before, after), (below, above)) in enumerate(
-            zip(pairwise(values), pairwise(slopes), strict=True)
+            zip(pairwise(values), pairwise(pulls), strict=True)
         ):
-            layers = [network.linear(index) for network in networks]
-            weights = [layer.weight.detach() for layer in layers]
-            biases = [layer.bias.detach() for layer in layers]
-            own = [(layer.weight.grad, layer.bias.grad) for layer in layers]
-            self._products.append(
-                list(zip(biases, before, [weight.mT for weight in weights], after, strict=True))
-            )
-            self._weight_gradients.append(
-                list(zip(above, [part.mT for part in above], before, own, strict=True))
-            )
-            self._input_gradients.append(list(zip(above, weights, below, strict=True)))
+            linear = [network.linear(index) for network in networks]
+            weights = [each.weight.detach() for each in linear]
+            biases = [each.bias.detach() for each in linear]
+            own = [(each.weight.grad, each.bias.grad) for each in linear]
+            places = range(len(networks))
+            self._products.append([(biases[i], before[i], weights[i].mT, after[i]) for i in places])
+            self._weight_gradients.append([(above[i], above[i].mT, before[i], *own[i]) for i in places])
+            self._input_gradients.append([(above[i], weights[i], below[i]) for i in places])
 
     def forward(self) -> None:
         for products, hidden in zip(self._products, [*self._hidden, None], strict=True):
@@ -155,10 +150,18 @@ class _Stack:
 
     def backward(self) -> None:
         for index in reversed(range(len(self._products))):
-            for gradient, turned, value, (weight, bias) in self._weight_gradients[index]:
+            for gradient, turned, value, weight, bias in self._weight_gradients[index]:
                 torch.mm(turned, value, out=weight)
                 torch.sum(gradient, 0, out=bias)
             if index:
                 for gradient, matrix, result in self._input_gradients[index]:
                     torch.mm(gradient, matrix, out=result)
                 self._backward_(self._hidden_gradients[index - 1], self._hidden[index - 1])
+
+
+def _one_behind_another(like: Sequence[Tensor], widths: Sequence[int]) -> tuple[Tensor, list[Tensor]]:
+    """Memory for a matrix of each width, with as many rows as each of ``like``: all of it, and its parts."""
+    shapes = [(len(rows), width) for rows, width in zip(like, widths, strict=True)]
+    flat = like[0].new_empty(sum(rows * width for rows, width in shapes))
+    parts = flat.split([rows * width for rows, width in shapes])
+    return flat, [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]

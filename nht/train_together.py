@@ -164,7 +164,7 @@ def _begin(
         max_steps=max_steps,
         generator=torch.Generator().manual_seed(seed),
         rates=cosine(learning_rate, max_steps),
-        best=EarlyStopping(map, data[held_out], patience),
+        best=EarlyStopping(map, data[held_out], patience),  # before a limit moves the start, as alone
         limit=None if map.lipschitz is None else LipschitzProjection(map),
     )
     begun.seconds = time.perf_counter() - start
@@ -174,24 +174,31 @@ def _begin(
 def _descend(begun: Sequence[_Training], data: TensorDictBase, progress: ProgressTogether | None) -> None:
     """Take gradient steps until every map is done; those that are leave the others' calls."""
     optimiser = torch.optim.Adam([{"params": list(one.map.parameters())} for one in begun], fused=True)
-    going_on, step, steps = list(begun), 0, None
+    going_on, step = list(begun), 0
+    steps = _Steps(going_on, data, optimiser)
     while going_on:
         start = time.perf_counter()
-        if steps is None:
-            steps = _Steps(going_on, data)
-            optimiser.param_groups = [optimiser.param_groups[begun.index(one)] for one in going_on]
-            begun = going_on
-        until = min(min(one.max_steps for one in going_on), step - step % EVALUATE_EVERY + EVALUATE_EVERY)
-        losses = steps.take(until - step, optimiser)
+        until = min(step - step % EVALUATE_EVERY + EVALUATE_EVERY, *(one.max_steps for one in going_on))
+        losses = steps.take(until - step)
         step, share = until, (time.perf_counter() - start) / len(going_on)
         still = []
         for one, loss in zip(going_on, losses, strict=True):
             one.seconds += share
             if _looked(one, step, loss, progress):
                 still.append(one)
-        steps.evaluated()
-        if len(still) < len(going_on):
-            going_on, steps = still, None
+        if 0 < len(still) < len(going_on):
+            _drop(optimiser, [all(one is not other for other in still) for one in going_on])
+            steps = _Steps(still, data, optimiser)
+        steps.follow()
+        going_on = still
+
+
+def _drop(optimiser: torch.optim.Optimizer, gone: Sequence[bool]) -> None:
+    """Let an optimiser forget some of its groups."""
+    groups = list(zip(optimiser.param_groups, gone, strict=True))
+    optimiser.param_groups = [group for group, left in groups if not left]
+    for parameter in (parameter for group, left in groups if left for parameter in group["params"]):
+        optimiser.state.pop(parameter, None)
 
 
 def _looked(one: _Training, step: int, loss: float, progress: ProgressTogether | None) -> bool:
@@ -218,16 +225,20 @@ class _Steps:
     Args:
         trainings: of the maps.
         data: context and actuation of all transitions.
+        optimiser: with a group for each map.
     """
 
-    def __init__(self, trainings: Sequence[_Training], data: TensorDictBase) -> None:
-        self._trainings, self._data = trainings, data
+    def __init__(
+        self, trainings: Sequence[_Training], data: TensorDictBase, optimiser: torch.optim.Optimizer
+    ) -> None:
+        self._trainings, self._data, self._optimiser = trainings, data, optimiser
         rows = [one.batch_size for one in trainings]
-        maps = [one.map for one in trainings]
+        maps: list[Any] = [one.map for one in trainings]
         like = data["actuation"]
         self._shares = torch.cat([like.new_full((count,), 1 / count) for count in rows])  # of each map's mean
         self._rows = rows
-        self._map, self._read = copy.deepcopy(maps[0]).requires_grad_(requires_grad=False), []
+        self._map = copy.deepcopy(maps[0]).requires_grad_(requires_grad=False)
+        self._read: list[_Given] = []
         self._networks: list[NetworksTogether | ConstantsTogether] = [
             NetworksTogether([map.network for map in maps], rows)
         ]
@@ -245,8 +256,9 @@ class _Steps:
         self._read.append(_Given())
         return self._read[-1]
 
-    def take(self, count: int, optimiser: torch.optim.Optimizer) -> list[float]:
-        """Take steps: the loss of each map in the last of them."""
+    def take(self, count: int) -> list[float]:
+        """Take steps, at least one: the loss of each map in the last of them."""
+        losses = self._shares
         for index in self._drawn(count):
             batch = TensorDict(
                 {name: self._data[name][index] for name in ("context", "actuation")}, len(index)
@@ -255,9 +267,9 @@ class _Steps:
             gradients = torch.autograd.grad(losses @ self._shares, [given.output for given in self._read])
             for networks, gradient in zip(self._networks, gradients, strict=True):
                 networks.backward(gradient)
-            for group, one in zip(optimiser.param_groups, self._trainings, strict=True):
+            for group, one in zip(self._optimiser.param_groups, self._trainings, strict=True):
                 group["lr"] = next(one.rates)
-            optimiser.step()
+            self._optimiser.step()
             self._limits.step()
         return [float(own.mean()) for own in losses.detach().split(self._rows)]
 
@@ -275,7 +287,7 @@ class _Steps:
         ]
         yield from torch.cat(drawn, dim=1).to(self._data.device)
 
-    def evaluated(self) -> None:
+    def follow(self) -> None:
         """After maps were brought within their limits exactly."""
         self._limits.follow()
 
