@@ -13,6 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from nht.adam_together import AdamTogether
 from nht.demos import Demos
 from nht.limits_together import LimitsTogether
 from nht.lipschitz import LipschitzProjection
@@ -173,32 +174,24 @@ def _begin(
 
 def _descend(begun: Sequence[_Training], data: TensorDictBase, progress: ProgressTogether | None) -> None:
     """Take gradient steps until every map is done; those that are leave the others' calls."""
-    optimiser = torch.optim.Adam([{"params": list(one.map.parameters())} for one in begun], fused=True)
+    adam = AdamTogether([one.map for one in begun])
     going_on, step = list(begun), 0
-    steps = _Steps(going_on, data, optimiser)
+    steps = _Steps(going_on, data, adam)
     while going_on:
         start = time.perf_counter()
         until = min(step - step % EVALUATE_EVERY + EVALUATE_EVERY, *(one.max_steps for one in going_on))
         losses = steps.take(until - step)
         step, share = until, (time.perf_counter() - start) / len(going_on)
         still = []
-        for one, loss in zip(going_on, losses, strict=True):
+        for place, (one, loss) in enumerate(zip(going_on, losses, strict=True)):
             one.seconds += share
             if _looked(one, step, loss, progress):
-                still.append(one)
+                still.append(place)
         if 0 < len(still) < len(going_on):
-            _drop(optimiser, [all(one is not other for other in still) for one in going_on])
-            steps = _Steps(still, data, optimiser)
+            adam.keep(still)
+            steps = _Steps([going_on[place] for place in still], data, adam)
         steps.follow()
-        going_on = still
-
-
-def _drop(optimiser: torch.optim.Optimizer, gone: Sequence[bool]) -> None:
-    """Let an optimiser forget some of its groups."""
-    groups = list(zip(optimiser.param_groups, gone, strict=True))
-    optimiser.param_groups = [group for group, left in groups if not left]
-    for parameter in (parameter for group, left in groups if left for parameter in group["params"]):
-        optimiser.state.pop(parameter, None)
+        going_on = [going_on[place] for place in still]
 
 
 def _looked(one: _Training, step: int, loss: float, progress: ProgressTogether | None) -> bool:
@@ -225,13 +218,11 @@ class _Steps:
     Args:
         trainings: of the maps.
         data: context and actuation of all transitions.
-        optimiser: with a group for each map.
+        adam: moves the maps' parameters.
     """
 
-    def __init__(
-        self, trainings: Sequence[_Training], data: TensorDictBase, optimiser: torch.optim.Optimizer
-    ) -> None:
-        self._trainings, self._data, self._optimiser = trainings, data, optimiser
+    def __init__(self, trainings: Sequence[_Training], data: TensorDictBase, adam: AdamTogether) -> None:
+        self._trainings, self._data, self._adam = trainings, data, adam
         rows = [one.batch_size for one in trainings]
         maps: list[Any] = [one.map for one in trainings]
         like = data["actuation"]
@@ -260,16 +251,13 @@ class _Steps:
         """Take steps, at least one: the loss of each map in the last of them."""
         losses = self._shares
         for index in self._drawn(count):
-            batch = TensorDict(
-                {name: self._data[name][index] for name in ("context", "actuation")}, len(index)
-            )
+            rows = {name: self._data[name].index_select(0, index) for name in ("context", "actuation")}
+            batch = TensorDict(rows, len(index))
             losses = self._losses(batch)
             gradients = torch.autograd.grad(losses @ self._shares, [given.output for given in self._read])
             for networks, gradient in zip(self._networks, gradients, strict=True):
                 networks.backward(gradient)
-            for group, one in zip(self._optimiser.param_groups, self._trainings, strict=True):
-                group["lr"] = next(one.rates)
-            self._optimiser.step()
+            self._adam.step([next(one.rates) for one in self._trainings])
             self._limits.step()
         return [float(own.mean()) for own in losses.detach().split(self._rows)]
 
