@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -25,12 +25,11 @@ from nht.storable import check_storable
 from nht.train import EVALUATE_EVERY, EarlyStopping, MapTraining, check_numbers, finished, train_map
 from nht.training_data import context_keys_of, split_episodes, training_data
 
-Number = TypeVar("Number", int, float)
 ProgressTogether = Callable[[int, dict[str, float]], None]
 SHARING = (NHT, SCL)
 """Kinds that share their calls: their losses need no more than what networks of linear layers make of the context."""
-SHARED = ("context_dim", "actuation_dim", "action_dim", "context_keys", "offset")
-"""What maps that train together have alike, beside their class, precision and device."""
+SHARED = ("context_keys", "context_dim", "actuation_dim", "action_dim", "offset")
+"""What maps that train together have alike, beside their class, precision and device; the first unless it is told."""
 
 
 def train_maps(
@@ -72,40 +71,30 @@ def train_maps(
     Raises:
         KeyError, ValueError: as ``train_map``; and if maps differ in what they share, which is named.
     """
-    maps = list(maps)
-    each: dict[str, list[Any]] = {
-        name: _of_each(name, value, len(maps))
-        for name, value in {
-            "batch_size": batch_size,
-            "learning_rate": learning_rate,
-            "max_steps": max_steps,
-            "patience": patience,
-            "validation_share": validation_share,
-            "seed": seed,
-        }.items()
+    numbers = {
+        "batch_size": batch_size,
+        "learning_rate": learning_rate,
+        "max_steps": max_steps,
+        "patience": patience,
+        "validation_share": validation_share,
+        "seed": seed,
     }
-    own = [{name: values[place] for name, values in each.items()} for place in range(len(maps))]
-    _check_alike(maps)
-    for place, (map, numbers) in enumerate(zip(maps, own, strict=True)):
-        try:
-            check_numbers(**{name: value for name, value in numbers.items() if name != "seed"})
-            check_storable(map)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"map {place}: {error}") from error
+    own = _of_each(numbers, len(maps))
+    _check_alike(maps, SHARED if context_keys is None else SHARED[1:])
+    _check_each(maps, own)
     if not maps:
         return []
     keys = context_keys_of(demos, maps[0], context_keys)
-    if not all(_shares_calls(map) for map in maps):
-        return [
-            _alone(demos, maps[place], keys, place, progress, numbers) for place, numbers in enumerate(own)
-        ]
-    data = training_data(demos, maps[0], keys)
-    begun = [
-        _begin(place, map, demos, data, **numbers)
-        for place, (map, numbers) in enumerate(zip(maps, own, strict=True))
-    ]
-    _descend(begun, data, progress)
-    return [_result(one, demos, keys, data) for one in begun]
+    found: dict[int, MapTraining | FloatingPointError] = {}
+    sharing = [place for place, map in enumerate(maps) if _shares_calls(map)]
+    if sharing:
+        data = training_data(demos, maps[0], keys)
+        begun = [_begin(place, maps[place], demos, data, **own[place]) for place in sharing]
+        _descend(begun, data, progress)
+        found = {one.place: _result(one, demos, keys, data) for one in begun}
+    for place in set(range(len(maps))) - set(sharing):
+        found[place] = _alone(demos, maps[place], keys, place, progress, own[place])
+    return [found[place] for place in range(len(maps))]
 
 
 @dataclass
@@ -327,15 +316,27 @@ def _shares_calls(map: ActionMap) -> bool:
     return type(map) in SHARING and not getattr(map, "multi_head", False)
 
 
-def _of_each(name: str, value: Number | Sequence[Number], count: int) -> list[Number]:
-    if isinstance(value, int | float):
-        return count * [value]
-    if len(value) != count:
-        raise ValueError(f"{name} must be one number, or one for each of {count} maps, got {len(value)}.")
-    return list(value)
+def _of_each(numbers: dict[str, Any], count: int) -> list[dict[str, Any]]:
+    """The numbers of each map."""
+    for name, value in numbers.items():
+        if not isinstance(value, int | float) and len(value) != count:
+            raise ValueError(f"{name} must be one number, or one for each of {count} maps, got {len(value)}.")
+    return [
+        {name: value if isinstance(value, int | float) else value[place] for name, value in numbers.items()}
+        for place in range(count)
+    ]
 
 
-def _check_alike(maps: Sequence[ActionMap]) -> None:
+def _check_each(maps: Sequence[ActionMap], own: Sequence[dict[str, Any]]) -> None:
+    for place, (map, numbers) in enumerate(zip(maps, own, strict=True)):
+        try:
+            check_numbers(**{name: value for name, value in numbers.items() if name != "seed"})
+            check_storable(map)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"map {place}: {error}") from error
+
+
+def _check_alike(maps: Sequence[ActionMap], shared: Sequence[str]) -> None:
     seen: dict[int, int] = {}
     for place, map in enumerate(maps):
         first = maps[0]
@@ -348,7 +349,7 @@ def _check_alike(maps: Sequence[ActionMap]) -> None:
             raise ValueError(
                 f"map {place} is map {twin} once more: each is trained in place, so give it a twin."
             )
-        kept, found = _shared(first), _shared(map)
+        kept, found = _shared(first, shared), _shared(map, shared)
         for name, value in found.items():
             if value != kept[name]:
                 raise ValueError(
@@ -356,6 +357,6 @@ def _check_alike(maps: Sequence[ActionMap]) -> None:
                 )
 
 
-def _shared(map: ActionMap) -> dict[str, Any]:
-    told = {name: getattr(map, name, None) for name in SHARED}
+def _shared(map: ActionMap, names: Sequence[str]) -> dict[str, Any]:
+    told = {name: getattr(map, name, None) for name in names}
     return told | {"precision": map.action_scale.dtype, "device": map.action_scale.device}

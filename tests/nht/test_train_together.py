@@ -192,6 +192,17 @@ class Crooked(nht.NHT):
         return 2 * super().loss(batch)
 
 
+def test_maps_with_heads_train_beside_the_others(demos: Demos) -> None:
+    def made() -> list[ActionMap]:
+        return [nht.NHT(CONTEXT_DIM, N, K, hidden=(8,), multi_head=heads) for heads in (False, True, False)]
+
+    maps, twins = made(), made()
+    assert len(succeeded(train_maps(demos, maps, seed=[0, 1, 2], max_steps=20))) == 3
+    for seed, (map, twin) in enumerate(zip(maps, twins, strict=True)):
+        train_map(demos, twin, seed=seed, max_steps=20)
+        close(map, twin)
+
+
 def test_subclasses_and_heads_are_trained_as_they_are_alone(demos: Demos) -> None:
     for make in (
         lambda: Crooked(CONTEXT_DIM, N, K, hidden=(8,)),
@@ -313,6 +324,15 @@ def test_maps_that_differ_in_what_they_share(demos: Demos, other: Any, message: 
     with pytest.raises(ValueError, match=message):
         train_maps(demos, [first, other()], max_steps=1)
     assert all(torch.equal(value, before[name]) for name, value in first.state_dict().items())
+
+
+def test_maps_of_other_observations(demos: Demos) -> None:
+    maps = varied()[:2]
+    maps[1].context_keys = ("elbow",)
+    with pytest.raises(ValueError, match=r"share context_keys: map 0 has None, map 1 has \('elbow',\)"):
+        train_maps(demos, maps, max_steps=1)
+    train_maps(demos, maps, context_keys=["context"], max_steps=1)  # as told
+    assert maps[1].context_keys == ("context",)
 
 
 def test_one_map_twice(demos: Demos) -> None:
