@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/speed/map_population.py
 
-NHT on 10,000 demonstrated transitions of WAMWipe, 500 gradient steps each (200 of the whole table), k = 2, one thread.
+NHT on 10,000 demonstrated transitions of WAMWipe, 500 gradient steps each (100 of the whole table), k = 2, one thread.
 Widths, depths, activations, limits, learning rates and batch sizes are the first draws of Table 2
 (``configs/search/wam.yaml``); once as they are, 16 to 1,024 units, and once those of at most 256 and 64. Beside these
 sixteen seeds of the recipes' default. Processor seconds per map and 1,000 steps, fit and measuring included; ways take
@@ -37,7 +37,7 @@ TRANSITIONS, MAPS = 10_000, 64
 SPACE = Path(__file__).parents[2] / "configs" / "search" / "wam.yaml"
 RESULTS = Path(__file__).parents[1] / "results" / "map_population"
 WHOLE = "Table 2"  # a round of as many steps takes a quarter of an hour: fewer, and one, have to do
-STEPS = {WHOLE: 200}
+STEPS = {WHOLE: 100}
 KEYS = ["tool_position", "joint_angle"]
 
 
