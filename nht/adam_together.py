@@ -18,7 +18,7 @@ class AdamTogether:
     """
 
     def __init__(self, maps: Sequence[nn.Module]) -> None:
-        self._groups: list[tuple[list[Tensor], ...]] = []
+        self._groups: list[tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]] = []
         for map in maps:
             own = [parameter.detach() for parameter in map.parameters()]
             gradients = [value.grad for value in map.parameters() if value.grad is not None]

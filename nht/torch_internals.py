@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -29,10 +28,10 @@ def write_machine_code(program: ExportedProgram, path: Path, metadata: dict[str,
 
 @torch.no_grad()
 def adam_step(
-    parameters: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    means: Sequence[Tensor],
-    squares: Sequence[Tensor],
+    parameters: list[Tensor],
+    gradients: list[Tensor],
+    means: list[Tensor],
+    squares: list[Tensor],
     step: Tensor,
     rate: float,
 ) -> None:
