@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from nht.scl import SCL
     from nht.storage import load_map, save_map
     from nht.train import MapTraining, projection_error, train_map
+    from nht.train_together import train_maps
 
 _NAMES = {
     "actuation_lipschitz": ("actuation_certificate",),
@@ -44,6 +45,7 @@ _NAMES = {
     "scl": ("SCL",),
     "storage": ("load_map", "save_map"),
     "train": ("MapTraining", "projection_error", "train_map"),
+    "train_together": ("train_maps",),
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
@@ -75,6 +77,7 @@ __all__ = [
     "save_map",
     "to_minari",
     "train_map",
+    "train_maps",
 ]
 
 __version__ = version("nht")

@@ -182,6 +182,10 @@ class ActionMap(nn.Module, ABC):
             raise ValueError(f"action_scale must be a positive, finite number, got {given}.")
         self.action_scale.copy_(scale)
 
+    def _reconstruct(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """An actuation, (*batch, n), projected and mapped back."""
+        return self(self.project(actuation, context), context)
+
     def loss(self, batch: TensorDictBase) -> Tensor:
         """What training minimises: the mean of |u - u_hat|^2, u_hat being u projected and mapped back.
 
@@ -190,7 +194,7 @@ class ActionMap(nn.Module, ABC):
                 that needs it.
         """
         actuation, context = batch["actuation"], batch["context"]
-        return (actuation - self(self.project(actuation, context), context)).square().sum(-1).mean()
+        return (actuation - self._reconstruct(actuation, context)).square().sum(-1).mean()
 
     def fit(self, batch: TensorDictBase) -> bool:
         """Prepare the map from all training data, before any gradient step.

@@ -85,7 +85,7 @@ class LinearActionMap(ActionMap):
         """The way from rest to an actuation, u - u0(c), (*batch, n)."""
         return actuation if self.offset_model is None else actuation - self.offset_model(context)
 
-    def offset_loss(self, way: Tensor) -> Tensor | float:
+    def offset_losses(self, way: Tensor) -> Tensor | float:
         """An extra loss term that trains a contextual u0: it has the gradient of |u - u0(c)|^2 and the value 0.
 
         The loss leaves u0 open within the span of Q(c), where an action has the same effect. The conditional mean of
@@ -94,8 +94,11 @@ class LinearActionMap(ActionMap):
 
         Args:
             way: u - u0(c), (batch, n).
+
+        Returns:
+            That of each transition, (batch,).
         """
         if not isinstance(self.offset_model, NetworkOffset):
             return 0.0
-        pull = way.square().sum(-1).mean()
+        pull = way.square().sum(-1)
         return pull - pull.detach()

@@ -146,9 +146,12 @@ class NetworkProjection:
 
     @torch.no_grad()
     def exact(self) -> None:
-        """Before weights are kept."""
+        """Before weights are kept. Weights that are not finite, which nobody will keep, stay as they are."""
+        matrices = _matrices(self.network)
+        if not all(bool(matrix.isfinite().all()) for matrix in matrices):
+            return
         self.directions = []
-        for i, matrix in enumerate(_matrices(self.network)):
+        for i, matrix in enumerate(matrices):
             _, singular, right = torch.linalg.svd(matrix.double(), full_matrices=False)
             self.directions.append(right[..., :1, :].mT.to(matrix.dtype))
             norm = torch.linalg.vector_norm(singular, dim=-1) if self.frobenius else singular[..., 0]

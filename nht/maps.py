@@ -116,11 +116,23 @@ class NHT(LinearActionMap):
         way = self.to_rest(actuation, context)
         return householder_coordinates(self.reflectors(context), way)[..., : self.action_dim]
 
+    def _reconstruct(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """u0(c) + Q(c) Q(c)^T (u - u0(c)), with the reflectors computed once."""
+        if type(self) is not NHT:  # a subclass may go another way, there or back
+            return super()._reconstruct(actuation, context)
+        reflectors = self.reflectors(context)
+        action = householder_coordinates(reflectors, self.to_rest(actuation, context))[..., : self.action_dim]
+        return self.from_rest(householder_apply(reflectors, action), context)
+
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """The mean of |u - Q Q^T u|^2 (Eq. 6), u measured from u0(c), read off the last n - k coordinates of u."""
+        """The mean of |u - Q Q^T u|^2 (Eq. 6), u measured from u0(c)."""
+        return self.losses(batch).mean()
+
+    def losses(self, batch: TensorDictBase) -> Tensor:
+        """The loss of each transition, (batch,), read off the last n - k coordinates of u."""
         way = self.to_rest(batch["actuation"], batch["context"])
         coordinates = householder_coordinates(self.reflectors(batch["context"]), way)
-        return coordinates[..., self.action_dim :].square().sum(-1).mean() + self.offset_loss(way)
+        return coordinates[..., self.action_dim :].square().sum(-1) + self.offset_losses(way)
 
     @torch.no_grad()
     def fit(self, batch: TensorDictBase) -> bool:

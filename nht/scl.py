@@ -72,8 +72,20 @@ class SCL(LinearActionMap):
         """Q(c), any n x k matrix."""
         return self.network(context).unflatten(-1, (self.actuation_dim, self.action_dim))
 
+    def _reconstruct(self, actuation: Tensor, context: Tensor) -> Tensor:
+        """u0(c) + Q(c) Q(c)^+ (u - u0(c)), with the basis computed once."""
+        if type(self) is not SCL:  # a subclass may go another way, there or back
+            return super()._reconstruct(actuation, context)
+        basis = self.basis(context)
+        action = least_squares(basis, self.to_rest(actuation, context))
+        return self.from_rest((basis @ action.unsqueeze(-1)).squeeze(-1), context)
+
     def loss(self, batch: TensorDictBase) -> Tensor:
-        """The mean of |u - Q Q^+ u|^2 (Eq. 6), u measured from u0(c).
+        """The mean of |u - Q Q^+ u|^2 (Eq. 6), u measured from u0(c)."""
+        return self.losses(batch).mean()
+
+    def losses(self, batch: TensorDictBase) -> Tensor:
+        """The loss of each transition, (batch,).
 
         At the least-squares action the loss does not change with the action (envelope theorem). So the action counts
         as a constant in the gradient, and no derivative of an inverse is ever taken.
@@ -82,7 +94,7 @@ class SCL(LinearActionMap):
         way = self.to_rest(batch["actuation"], context)
         action = least_squares(basis, way).detach()
         missed = way - (basis @ action.unsqueeze(-1)).squeeze(-1)
-        return missed.square().sum(-1).mean() + self.offset_loss(way)
+        return missed.square().sum(-1) + self.offset_losses(way)
 
     def fit(self, batch: TensorDictBase) -> bool:
         """Set the normaliser and where u0 starts; the weights are left to gradient steps."""

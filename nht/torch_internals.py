@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torch._inductor import aoti_compile_and_package
+import torch
+from torch import Tensor
 from torch.export import ExportedProgram
 
 
@@ -19,5 +20,45 @@ def write_machine_code(program: ExportedProgram, path: Path, metadata: dict[str,
         path: of the package, ending in .pt2.
         metadata: entries, by name.
     """
+    from torch._inductor import aoti_compile_and_package  # takes a second, and few compile
+
     options = {"aot_inductor.metadata": metadata}
     aoti_compile_and_package(program, package_path=str(path), inductor_configs=options)
+
+
+@torch.no_grad()
+def adam_step(
+    parameters: list[Tensor],
+    gradients: list[Tensor],
+    means: list[Tensor],
+    squares: list[Tensor],
+    step: Tensor,
+    rate: float,
+) -> None:
+    """Take the step that ``torch.optim.Adam(fused=True)`` takes, without what it looks up each time.
+
+    Relies on ``torch._fused_adam_``, the operation behind that optimiser, and on its arguments.
+
+    Args:
+        parameters: what is moved, in place.
+        gradients: of each parameter.
+        means: running means of the gradients, at first 0; changed in place.
+        squares: running means of their squares, likewise.
+        step: scalar float32, on the parameters' device: how many steps this one makes.
+        rate: the learning rate.
+    """
+    torch._fused_adam_(
+        parameters,
+        gradients,
+        means,
+        squares,
+        [],
+        len(parameters) * [step],
+        lr=rate,
+        beta1=0.9,
+        beta2=0.999,
+        weight_decay=0.0,
+        eps=1e-8,
+        amsgrad=False,
+        maximize=False,
+    )

@@ -73,7 +73,7 @@ def train_map(
         ValueError: on demonstrations that do not fit the map, or have fewer than k independent actuations or
             two episodes; on a number out of range. FloatingPointError: if the loss diverged from the start.
     """
-    _check_numbers(batch_size, learning_rate, max_steps, patience, validation_share)
+    check_numbers(batch_size, learning_rate, max_steps, patience, validation_share)
     check_storable(map)
     start = time.perf_counter()
     keys = context_keys_of(demos, map, context_keys)
@@ -86,24 +86,47 @@ def train_map(
     if not map.fit(training):
         rounds = _gradient_steps(map, training, batch_size, learning_rate, max_steps, seed)
         steps, best_step = _keep_best(map, validation, rounds, patience, progress)
+    seconds = time.perf_counter() - start
+    return finished(
+        map, demos, keys, data, held_out, {"steps": steps, "best_step": best_step, "seconds": seconds}
+    )
+
+
+def finished(
+    map: ActionMap,
+    demos: Demos,
+    keys: tuple[NestedKey, ...],
+    data: TensorDictBase,
+    held_out: Tensor,
+    told: dict[str, float],
+) -> MapTraining:
+    """A map with its final weights, told what it is to know of its demonstrations, and measured.
+
+    Args:
+        map: whose gradient steps are done.
+        demos: the demonstrations.
+        keys: the entries that make up the context.
+        data: context and actuation of all transitions.
+        held_out: (T,), true where training did not look.
+        told: "steps", "best_step", and "seconds" so far.
+    """
+    start = time.perf_counter()
     map.eval()
     map.context_keys, map.data_fingerprint = keys, demos.fingerprint
     _set_bounds(map, data)
-    return MapTraining(
-        map,
-        {
-            "validation_error": projection_error(map, validation["context"], validation["actuation"]),
-            "training_error": projection_error(map, training["context"], training["actuation"]),
-            "steps": steps,
-            "best_step": best_step,
-            "seconds": time.perf_counter() - start,
-            "certificate": certificate(map),
-            "action_scale": float(map.action_scale),
-            "transitions": len(data),
-            "training_episodes": len(torch.unique(demos.episode[~held_out])),
-            "validation_episodes": len(torch.unique(demos.episode[held_out])),
-        },
-    )
+    training, validation = data[~held_out], data[held_out]
+    metrics = {
+        "validation_error": projection_error(map, validation["context"], validation["actuation"]),
+        "training_error": projection_error(map, training["context"], training["actuation"]),
+        **told,
+        "certificate": certificate(map),
+        "action_scale": float(map.action_scale),
+        "transitions": len(data),
+        "training_episodes": len(torch.unique(demos.episode[~held_out])),
+        "validation_episodes": len(torch.unique(demos.episode[held_out])),
+    }
+    metrics["seconds"] += time.perf_counter() - start
+    return MapTraining(map, metrics)
 
 
 @torch.no_grad()
@@ -117,7 +140,7 @@ def projection_error(map: ActionMap, context: Tensor, actuation: Tensor) -> floa
     """
     missed = total = 0.0
     for c, u in zip(torch.split(context, CHUNK), torch.split(actuation, CHUNK), strict=True):
-        missed += float((u - map(map.project(u, c), c)).double().square().sum())
+        missed += float((u - map._reconstruct(u, c)).double().square().sum())
         total += float(u.double().square().sum())
     if total == 0:
         raise ValueError("the projection error is relative to the actuations, and these are all zero.")
@@ -167,25 +190,63 @@ def _keep_best(
 ) -> tuple[int, int]:
     """Train until the validation error stops falling: the steps made, and the step of the best weights."""
     start = time.perf_counter()
-    # The start counts, too: a map that starts at the best plane never ends below it.
-    best_error, best_step, step = projection_error(map, validation["context"], validation["actuation"]), 0, 0
-    best_weights, diverged = copy.deepcopy(map.state_dict()), True
+    best = EarlyStopping(map, validation, patience)
     for step, loss in rounds:
-        if not math.isfinite(loss):
-            break
-        diverged = False
-        error = projection_error(map, validation["context"], validation["actuation"])
-        if error < best_error:
-            best_error, best_step, best_weights = error, step, copy.deepcopy(map.state_dict())
-        if progress is not None:
+        goes_on = best.look(step, loss)
+        if progress is not None and math.isfinite(loss):
             seconds = time.perf_counter() - start
-            progress({"step": step, "loss": loss, "validation_error": error, "seconds": seconds})
-        if step - best_step >= patience:
+            progress({"step": step, "loss": loss, "validation_error": best.error, "seconds": seconds})
+        if not goes_on:
             break
-    if diverged:
-        raise FloatingPointError(f"training diverged in the first {step} steps; lower learning_rate.")
-    map.load_state_dict(best_weights)
-    return step, best_step
+    return best.steps, best.restore()
+
+
+class EarlyStopping:
+    """Watches the validation error of a map in training, and keeps the weights of the lowest.
+
+    Args:
+        map: in training. The start counts, too: a map that starts at the best plane never ends below it.
+        validation: what was held out.
+        patience: steps without a better error after which training ends.
+
+    Attributes:
+        steps: made, when it last looked.
+        error: what it saw then.
+    """
+
+    def __init__(self, map: ActionMap, validation: TensorDictBase, patience: int) -> None:
+        self._map, self._validation, self._patience = map, validation, patience
+        self.steps, self.error = 0, self._measured()
+        self._best_step, self._best_error, self._best_weights = 0, self.error, copy.deepcopy(map.state_dict())
+        self._diverged = True  # until the first finite loss
+
+    def _measured(self) -> float:
+        return projection_error(self._map, self._validation["context"], self._validation["actuation"])
+
+    def look(self, step: int, loss: float) -> bool:
+        """Whether training goes on after this step, which had this loss."""
+        self.steps = step
+        if not math.isfinite(loss):
+            return False
+        self._diverged = False
+        self.error = self._measured()
+        if self.error < self._best_error:
+            self._best_step, self._best_error = step, self.error
+            self._best_weights = copy.deepcopy(self._map.state_dict())
+        return step - self._best_step < self._patience
+
+    def restore(self) -> int:
+        """Give the map its best weights back, and say of which step they are.
+
+        Raises:
+            FloatingPointError: if the loss was not finite when it was looked at first.
+        """
+        if self._diverged:
+            raise FloatingPointError(
+                f"training diverged in the first {self.steps} steps; lower learning_rate."
+            )
+        self._map.load_state_dict(self._best_weights)
+        return self._best_step
 
 
 @torch.no_grad()
@@ -196,9 +257,10 @@ def _set_bounds(map: ActionMap, data: TensorDictBase) -> None:
     map.actuation_high.copy_(data["actuation"].amax(0))
 
 
-def _check_numbers(
+def check_numbers(
     batch_size: int, learning_rate: float, max_steps: int, patience: int, validation_share: float
 ) -> None:
+    """Raise ValueError for a number out of range."""
     for name, value in (("batch_size", batch_size), ("max_steps", max_steps), ("patience", patience)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}.")

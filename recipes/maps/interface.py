@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -72,7 +73,58 @@ def trained_map(
                 progress=show,
             )
         finished = trained.map if align is None else _tool_aligned(trained.map, data, env.name)
-    finished = _configured(finished, map)
+    return _as_told(trained, finished, map)
+
+
+def train_maps(
+    maps: Sequence[MapConfig], env: EnvConfig, demos: DemosConfig, seeds: Sequence[int]
+) -> list[nht.MapTraining | FloatingPointError]:
+    """Train maps of one kind together, each as ``train_map`` would alone.
+
+    Args:
+        maps: of one kind, number of actions and offset.
+        env: the task.
+        demos: the demonstrations, which are in a folder.
+        seeds: of each map.
+
+    Returns:
+        What training gave, and for a map that diverged the error.
+
+    Raises:
+        ValueError: as ``train_map``.
+    """
+    keys = map_context_keys(maps[0], env)
+    data = nht.load_demos(demos.path or "", env=env.name)
+    widths = data.context(keys).shape[-1], data.actuation.shape[-1]
+    untrained = [make_map(map, *widths, seed, env) for map, seed in zip(maps, seeds, strict=True)]
+    made = len(maps) * [0]
+    with progress_bar(
+        sum(map.max_steps for map in maps), f"{len(maps)} maps {maps[0].kind}", "step", unit_scale=True
+    ) as bar:
+
+        def show(place: int, metrics: dict[str, float]) -> None:
+            bar.update(int(metrics["step"]) - made[place])
+            made[place] = int(metrics["step"])
+
+        found = nht.train_maps(
+            data,
+            untrained,
+            context_keys=keys,
+            batch_size=[map.batch_size for map in maps],
+            learning_rate=[map.learning_rate for map in maps],
+            max_steps=[map.max_steps for map in maps],
+            seed=list(seeds),
+            progress=show,
+        )
+    return [
+        each if isinstance(each, FloatingPointError) else _as_told(each, each.map, map)
+        for each, map in zip(found, maps, strict=True)
+    ]
+
+
+def _as_told(trained: nht.MapTraining, map: nht.ActionMap, settings: MapConfig) -> nht.MapTraining:
+    """What training gave, with the map as a run uses it."""
+    finished = _configured(map, settings)
     return nht.MapTraining(finished, trained.metrics | {"action_scale": float(finished.action_scale)})
 
 

@@ -6,7 +6,7 @@ import csv
 import json
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -43,6 +43,7 @@ class RunFolder:
     Args:
         config: the whole configuration of the run, saved as ``config.yaml``.
         ranks: the processes that learn together.
+        make_map: gives the run its map, from its configuration and the number of motors.
 
     Raises:
         FileExistsError: if ``run.resume`` is false and the folder holds another run or an unfinished one; or if another
@@ -58,7 +59,9 @@ class RunFolder:
         map: the run's action map.
     """
 
-    def __init__(self, config: Training, ranks: Ranks) -> None:
+    def __init__(
+        self, config: Training, ranks: Ranks, make_map: Callable[[Training, int], nht.MapTraining] = run_map
+    ) -> None:
         if config.seeds is not None:
             raise ValueError(
                 f"{name_of(type(config))} trains one learner at a time: ddpg and ppo train several together, got "
@@ -69,6 +72,7 @@ class RunFolder:
         self.metrics = self.path / METRICS_FILE
         self.resuming = False
         self._ranks = ranks
+        self._make_map = make_map
         self._started = time.perf_counter()
         self._open = ExitStack()
         self._dashboard: Dashboard | None = None
@@ -105,7 +109,7 @@ class RunFolder:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
         if not (kept := self.path / MAP_FILE).exists():
-            map, found = run_map(self.config, motors)
+            map, found = self._make_map(self.config, motors)
             mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
             if found:
                 with replacing(self.path / MAP_METRICS_FILE) as scratch:

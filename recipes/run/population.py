@@ -18,12 +18,14 @@ from nht.reading import entry, read_json
 from nht.recipes.maps.interface import number_of_actions
 from nht.recipes.maps.kinds import map_context_keys
 from nht.recipes.maps.side_by_side import MapsSideBySide
+from nht.recipes.maps.together import MapsOfRuns
 from nht.recipes.run.environments import base_env
-from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.folder import RunFolder, resolved
 from nht.recipes.run.learners import check_alike
 from nht.recipes.run.memory import check_memory
 from nht.recipes.run.metrics import FRAMES, TESTED
 from nht.recipes.run.ranks import Ranks
+from nht.recipes.run.saved_run import MAP_FILE
 from nht.recipes.sections import Training
 from nht.writing import replacing
 
@@ -112,11 +114,13 @@ class PopulationFolder:
         if not any(Path(folder).exists() for folder in folders):
             check_actions(configs)
         self.members: list[RunFolder] = []
+        unmade = [resolved(config) for config in configs if not (Path(config.run.folder) / MAP_FILE).exists()]
+        maps = MapsOfRuns(unmade)
         with ExitStack() as undo:
             for config in configs:
                 run = replace(config.run, resume="auto" if resume is True else resume)
                 fresh = not Path(run.folder).exists()
-                self.members.append(RunFolder(replace(config, run=run), ranks))
+                self.members.append(RunFolder(replace(config, run=run), ranks, maps))
                 if fresh:
                     undo.callback(shutil.rmtree, run.folder, ignore_errors=True)
                 undo.callback(self.members[-1].close)

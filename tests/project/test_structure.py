@@ -85,8 +85,12 @@ LAYERS = {
     "nht.storage": 7,
     "nht.training_data": 5,
     "nht.train": 8,
+    "nht.networks_together": 2,
+    "nht.limits_together": 6,
+    "nht.adam_together": 1,
+    "nht.train_together": 9,
     "nht.export": 8,
-    "nht": 9,
+    "nht": 10,
 }
 FAMILY_LAYER = 4
 

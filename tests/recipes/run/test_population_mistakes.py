@@ -123,7 +123,8 @@ def test_maps_of_other_numbers_of_actions(algorithm, shared, other, message, tmp
     def refuse(*_, **__):
         raise AssertionError("a map was trained")
 
-    monkeypatch.setattr(nht, "train_map", refuse)
+    for name in ("train_map", "train_maps"):
+        monkeypatch.setattr(nht, name, refuse)
     train = told_apart(algorithm, tmp_path, ["seed=1", *other], shared=shared)
     refused(tmp_path, ValueError, f"learners of one population {message}", train)
 
