@@ -28,7 +28,7 @@ from omegaconf import OmegaConf
 import nht
 from nht.recipes.data.recording import record_expert
 from nht.recipes.sections import DemosConfig, EnvConfig
-from nht.recipes.study.space import draw
+from nht.recipes.study.space import draw_settings
 
 sys.path.insert(0, str(Path(__file__).parent))
 from taking_turns import Row, provenance, show, write
@@ -65,7 +65,7 @@ def drawn(widest: int) -> list[Drawn]:
     space: Any = OmegaConf.to_container(OmegaConf.load(SPACE))
     found, configuration = [], 0
     while len(found) < MAPS:
-        told: dict[str, Any] = draw(space["space"], 0, configuration, "nht")
+        told: dict[str, Any] = draw_settings(space["space"], 0, configuration, "nht")
         told = {name.removeprefix("map."): value for name, value in told.items()}
         configuration += 1
         if told["hidden_units"] <= widest:

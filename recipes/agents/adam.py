@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -49,7 +49,7 @@ class LearnersAdam(torch.optim.Adam):
             else:
                 group["lr"] = rate * share
 
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+    def step(self, closure: Any = None) -> Any:
         """Take a step along the gradients."""
         for parameter, move, _ in self._apart:
             move.grad = parameter.grad
