@@ -128,7 +128,8 @@ def configured(setting: str, learners: int, folder: Path, more: list[str], half:
 
 def cost(setting: str, learners: int, half: bool) -> dict[str, float]:
     """Core-seconds per learner and 1,000,000 steps, and the largest memory [MB]."""
-    short, long = LENGTHS[setting]
+    few = max(1, 16 // learners)  # whose runs are longer: starting takes seconds, and not always as many
+    short, long = (few * steps for steps in LENGTHS[setting])
     train(setting, learners, half, short, short)  # warm-up
     before, after = (train(setting, learners, half, steps, steps) for steps in (short, long))
     often = train(setting, learners, half, long, short)
