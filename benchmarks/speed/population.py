@@ -69,10 +69,11 @@ SETTINGS: dict[str, list[str]] = {
 LENGTHS = {"search": (400, 2_000), "paper": (200, 800), "ppo": (2_048, 4_096)}  # steps
 COLUMNS = ("setting", "who", "learners", "bfloat16", "round", "core_seconds", "evaluations", "memory")
 MEAN_BATCH = 144  # of Table 2
+COUNTS = (1, 4, 16, 64, 256)
 PLAN = {
-    "search": [(1, False), (16, False), *((count, True) for count in (1, 4, 16, 64, 256))],
+    "search": [(1, False), (16, False), *((count, True) for count in COUNTS)],
     "paper": [(1, False), (1, True), (4, True), (16, True)],
-    "ppo": [(count, False) for count in (1, 4, 16, 64, 256)],
+    "ppo": [(count, False) for count in COUNTS],
 }
 
 
@@ -195,12 +196,15 @@ def show(file: Path) -> None:
         medians = own.groupby("learners")[["core_seconds", "memory"]].median()
         if len(medians) > 2:
             label = f"{setting}{', bfloat16' if half else ''}"
-            left.plot(medians.index, medians["core_seconds"] * medians.index, "o-", label=label)
+            left.plot(medians.index, medians["core_seconds"], "o-", label=label)
             right.plot(medians.index, medians["memory"], "o-", label=label)
-    left.set(xscale="log", yscale="log", xlabel="learners", ylabel="core-seconds for 1,000,000 steps of each")
-    right.set(xscale="log", yscale="log", xlabel="learners", ylabel="memory of the process [MB]")
+    left.set(ylabel="core-seconds per learner and 1,000,000 steps")
+    right.set(ylabel="memory of the process [MB]")
     left.legend()
     for axes in (left, right):
+        axes.set(xscale="log", xlabel="learners", ylim=(0, None))
+        axes.set_xticks(COUNTS, [str(count) for count in COUNTS])
+        axes.minorticks_off()
         axes.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(OUT / "growth.png", dpi=120)
