@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from nht.recipes.agents.adam import LearnersAdam
+from nht.recipes.agents.cloning import cloning_of
 from nht.recipes.agents.ddpg import DDPG, PaperDDPGLoss, networks
 from nht.recipes.agents.off_policy import (
     JointSoftUpdate,
@@ -48,7 +49,10 @@ def main(*configs: DDPG, together: str | None = None) -> None:
     features, actor, critic = learners.networks(partial(networks, envs.train))
     policy = TensorDictSequential(features, actor)
     rewards = reward_range(envs.train)
-    loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
+    cloning = cloning_of(algo.demos, ranks.device)
+    loss = PaperDDPGLoss(
+        actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards, cloning=cloning
+    )
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
     optimiser = LearnersAdam(
@@ -90,6 +94,8 @@ def main(*configs: DDPG, together: str | None = None) -> None:
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
             buffer.extend(rows(data))
+            if cloning is not None:
+                cloning.fade(record.frames)
 
             if record.frames >= algo.warmup_frames:
                 for batch in minibatches(

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
+from nht.recipes.agents.cloning import cloning_of
 from nht.recipes.agents.off_policy import (
     JointSoftUpdate,
     descend,
@@ -42,6 +43,7 @@ def main(config: TD3) -> None:
     policy = TensorDictSequential(features, actor)
 
     rewards = reward_range(envs.train)
+    cloning = cloning_of(algo.demos, ranks.device)
     loss = DirectTD3Loss(
         actor,
         critic,
@@ -49,6 +51,7 @@ def main(config: TD3) -> None:
         policy_noise=algo.policy_noise,
         noise_clip=algo.noise_clip,
         reward_range=rewards,
+        cloning=cloning,
     )
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
@@ -75,6 +78,8 @@ def main(config: TD3) -> None:
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
             buffer.extend(rows(data))
+            if cloning is not None:
+                cloning.fade(record.frames)
 
             if record.frames >= algo.warmup_frames:
                 for batch in minibatches(

@@ -144,7 +144,8 @@ def minibatches(
         device: where the networks are.
         draws: of several learners: minibatches are ``(L, B)`` then. Those of fewer steps are filled up to the largest,
             and a ``"weight"`` says what a step counts for.
-        demos: demonstrations, which have their share of every minibatch; None is none.
+        demos: demonstrations, which have their share of every minibatch; ``"demonstrated"`` then says what a step
+            counts for in a mean over them, 0 for a collected one. None is none.
     """
     if not updates:
         return
@@ -156,8 +157,10 @@ def minibatches(
     shown = 0 if demos is None else demos.count(batch_size)
     replay = buffer.sample(updates * (batch_size - shown)).to(device)
     if demos is not None:
-        parts = demos.buffer.sample(updates * shown).to(device), replay
-        replay = torch.cat([part.view(updates, -1) for part in parts], dim=1).reshape(-1)
+        parts = replay, demos.buffer.sample(updates * shown).to(device)
+        replay = torch.cat([part.view(updates, -1) for part in parts], dim=1)
+        replay["demonstrated"] = _demonstrated([batch_size], [shown], device).expand(updates, -1)
+        replay = replay.reshape(-1)
     with torch.no_grad():
         features(replay), features(replay["next"])
     yield from replay.split(batch_size)
@@ -180,6 +183,7 @@ def _minibatches_of_each(
     drawn = [_places(draws, len(source), counts, updates, device) for source, counts in sources]
     total = torch.tensor(sizes, device=device).unsqueeze(-1)
     weight = torch.cat([_filled(counts, device) for _, counts in sources], dim=-1) / total
+    demonstrated = None if demos is None else _demonstrated(sizes, shown, device)
     # One at a time stays in a processor's cache; a GPU would rather have few large calls.
     for places in zip(
         *(part.split(updates if device.type == "cuda" else 1, dim=1) for part in drawn), strict=True
@@ -192,6 +196,8 @@ def _minibatches_of_each(
         with torch.no_grad():
             features(replay), features(replay["next"])
         for batch in replay.unbind(1):
+            if demos is not None:
+                batch["demonstrated"] = demonstrated
             yield batch if min(sizes) == max(sizes) else batch.set("weight", weight)
 
 
@@ -211,6 +217,13 @@ def _places(draws: Draws, high: int, counts: Sequence[int], updates: int, device
 def _filled(counts: Sequence[int], device: torch.device) -> Tensor:
     """Which steps count, ``(L, max(counts))``: each learner's first ones."""
     return torch.arange(max(counts), device=device) < torch.tensor(counts, device=device).unsqueeze(-1)
+
+
+def _demonstrated(sizes: Sequence[int], shown: Sequence[int], device: torch.device) -> Tensor:
+    """What steps count for in a mean over the demonstrated ones, which stand behind the others, ``(L, width)``."""
+    counts, total = (torch.tensor(numbers, device=device).unsqueeze(-1) for numbers in (shown, sizes))
+    collected = max(size - own for size, own in zip(sizes, shown, strict=True))
+    return torch.nn.functional.pad(_filled(shown, device) * total / counts, (collected, 0))
 
 
 def mean_over(batch: TensorDictBase, values: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from nht.recipes.data.recording import record_expert
 from nht.recipes.sections import DemosConfig, EnvConfig
 
 OFF_POLICY = ("ddpg", "sac", "td3")
+CLONING = ["algo.demos.cloning=3", "algo.demos.cloning_frames=350", "algo.demos.q_filter=true"]
 COUNT = 250
 FRAME = pandas.testing.assert_frame_equal
 
@@ -50,6 +51,13 @@ def test_a_run_learns_from_them_and_says_how_they_fit(algorithm: str, demos: Pat
     assert noted["fingerprint"] == nht.load_demos(demos).fingerprint
 
 
+@pytest.mark.parametrize("algorithm", ["ddpg", "td3"])
+def test_a_run_may_imitate_them(algorithm: str, demos: Path, tmp_path: Path) -> None:
+    plain = run(algorithm, tmp_path / "plain", *told(demos, 0.5))
+    imitating = run(algorithm, tmp_path / "imitating", *told(demos, 0.5), "algo.demos.cloning=3")
+    assert (imitating["loss_actor"] > plain["loss_actor"]).all()
+
+
 def test_without_a_folder_the_expert_records_them_in_the_run(tmp_path: Path) -> None:
     asked = ["demos.transitions=300", "algo.demos.transitions=200", "map=nht", "map.max_steps=20"]
     recorded = run("ddpg", tmp_path / "recorded", *asked)
@@ -65,7 +73,7 @@ def test_without_a_folder_the_expert_records_them_in_the_run(tmp_path: Path) -> 
 def test_stopped_it_goes_on_as_if_it_had_not_been(
     share: float, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    longer = [*told(demos, share), "algo.total_frames=400", "algo.n_steps=2"]
+    longer = [*told(demos, share), "algo.total_frames=400", "algo.n_steps=2", *(CLONING if share else [])]
     whole = run("td3", tmp_path / "whole", *longer)
     with pytest.raises(KeyboardInterrupt), populations.breaking_off(monkeypatch, 300):
         run("td3", tmp_path / "stopped", *longer)
@@ -74,7 +82,7 @@ def test_stopped_it_goes_on_as_if_it_had_not_been(
     assert policies[0] == policies[1]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.4])
 def test_a_population_is_as_many_runs(
     share: float, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,7 +97,7 @@ def test_a_population_is_as_many_runs(
             "algo.updates_per_batch=10",
             "algo.n_steps=2",
         ]
-        learners[name] = [*own, *more, *told(demos, share)]
+        learners[name] = [*own, *more, *told(demos, share), *(CLONING if share else [])]
     with populations.watched(monkeypatch) as together:
         found = populations.train("ddpg", tmp_path / "together", learners)
     for learner, (name, own) in enumerate(learners.items()):
