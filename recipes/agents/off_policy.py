@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -158,9 +158,9 @@ def minibatches(
     replay = buffer.sample(updates * (batch_size - shown)).to(device)
     if demos is not None:
         parts = replay, demos.buffer.sample(updates * shown).to(device)
-        replay = torch.cat([part.view(updates, -1) for part in parts], dim=1)
-        replay["demonstrated"] = _demonstrated([batch_size], [shown], device).expand(updates, -1)
-        replay = replay.reshape(-1)
+        mixed: Any = torch.cat([part.view(updates, -1) for part in parts], dim=1)
+        mixed["demonstrated"] = _demonstrated([batch_size], [shown], device).expand(updates, -1)
+        replay = mixed.reshape(-1)
     with torch.no_grad():
         features(replay), features(replay["next"])
     yield from replay.split(batch_size)
@@ -192,11 +192,11 @@ def _minibatches_of_each(
             source[chosen.flatten()].view(chosen.shape).to(device)
             for source, chosen in zip(rows, places, strict=True)
         ]
-        replay = parts[0] if demos is None else torch.cat(parts, dim=2)
+        replay: Any = parts[0] if demos is None else torch.cat(parts, dim=2)
         with torch.no_grad():
             features(replay), features(replay["next"])
         for batch in replay.unbind(1):
-            if demos is not None:
+            if demonstrated is not None:
                 batch["demonstrated"] = demonstrated
             yield batch if min(sizes) == max(sizes) else batch.set("weight", weight)
 

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import TensorDictReplayBuffer
 
 from nht.recipes.agents.off_policy import DemosBuffer, replay_buffer
-from nht.recipes.run.demonstrations import demonstrated
+from nht.recipes.run.demonstrations import asked_for, demonstrated
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.population import PopulationFolder
 from nht.recipes.run.ranks import Ranks
@@ -42,7 +42,7 @@ def replay_demos(
         return None
     own = slice(ranks.rank, None, ranks.size)
     features.module.update(steps["observation"][..., own, :], ranks.sum)
-    share, found = folder.config.algo.demos.share, rows(steps)[own]
+    share, found = asked_for(folder.config).share, rows(steps)[own]
     if not share:
         buffer.extend(found)
         return None

@@ -31,7 +31,7 @@ DEMOS_FOLDER, DEMOS_FILE = "demos", "demos.json"
 NEEDED = ("observation", "reward", "terminated", ("next", "observation"))
 """What a replay buffer needs of demonstrations, beside their actuations, episodes and the map's context."""
 
-ROUNDING = 1e-6
+REWARD_TOLERANCE = 1e-6
 """How far a reward in single precision may lie beyond the task's bounds, as a share of these."""
 
 WARNED, REFUSED = 0.1, 1.0
@@ -39,10 +39,15 @@ WARNED, REFUSED = 0.1, 1.0
 map is a baseline that one may want to see, so it is warned about only."""
 
 
-def transitions_asked(config: Training) -> int:
-    """How many demonstrated transitions the run's algorithm learns from; 0 where it has no such option."""
+def asked_for(config: Training) -> ReplayDemosConfig:
+    """The demonstrations that the run's algorithm learns from; none where it has no such option."""
     demos = getattr(config.algo, "demos", None)
-    return demos.transitions if isinstance(demos, ReplayDemosConfig) else 0
+    return demos if isinstance(demos, ReplayDemosConfig) else ReplayDemosConfig()
+
+
+def transitions_asked(config: Training) -> int:
+    """How many demonstrated transitions the run's algorithm learns from."""
+    return asked_for(config).transitions
 
 
 def demos_path(config: Training) -> Path:
@@ -103,7 +108,7 @@ def check_demos(demos: nht.Demos, count: int, env: EnvConfig, name: str) -> None
     low, high = reward_range(task)
     rewards = data["reward"][:count]
     least, most = float(rewards.min()), float(rewards.max())
-    if least < low - ROUNDING * abs(low) or most > high + ROUNDING * abs(high):
+    if least < low - REWARD_TOLERANCE * abs(low) or most > high + REWARD_TOLERANCE * abs(high):
         raise ValueError(
             f"{name} has rewards from {least:.6g} to {most:.6g}, those of {env.name} lie in [{low:.6g}, {high:.6g}]."
         )

@@ -48,7 +48,7 @@ class TallNorm(torch.nn.Module):
 
     def __init__(self, learners: int) -> None:
         super().__init__()
-        self.register_buffer("scale", torch.rand(learners, 1, SIZE))
+        self.register_buffer("scale", torch.rand(learners, 1, 1, SIZE))  # beside (L, updates, B, SIZE)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return observation * self.scale
