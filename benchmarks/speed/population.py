@@ -9,11 +9,13 @@ of its own. Settings:
 - ``paper``: the paper's own DDPG: 3 x 256, 40 updates of 256 per 200 steps.
 - ``ppo``: OpenAI's ppo2 on HalfCheetah: 2 x 64, 32 x 10 minibatches of 64 per 2,048 steps, 16 copies a learner.
 
-Beside them stable-baselines3, one learner with the same networks, batch and ratio on the same task. Every figure is the
-difference of two lengths of the run, so that starting does not count; an evaluation is measured apart. Rounds take
-turns; the median counts, the spread is printed. Writes CSV, table and figure to ``results/population``.
+Beside them one learner with the same networks, batch and ratio, of stable-baselines3, and of SBX and CleanRL where it
+is said which Python has them (``other_libraries.py``). Every figure is the difference of two lengths of the run, so
+that starting does not count; an evaluation is measured apart. Rounds take turns; the median counts, the spread is
+printed. Writes CSV, table and figure to ``results/population``.
 
-    OMP_NUM_THREADS=1 python benchmarks/speed/population.py [search | paper | ppo ...] [rounds=3]
+    OMP_NUM_THREADS=1 python benchmarks/speed/population.py [search | paper | ppo ...] [rounds=3] \
+        [sbx=PYTHON] [cleanrl=PYTHON:CHECKOUT]
 """
 
 from __future__ import annotations
@@ -23,30 +25,30 @@ import csv
 import io
 import json
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from functools import partial
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import gymnasium
-import numpy as np
-import stable_baselines3
+import matplotlib.pyplot as plt
+import pandas
 import torch
 from omegaconf import OmegaConf
-from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from taking_turns import provenance
 
 import nht
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.launch import configure
+from nht.recipes.sections import Training
 from nht.recipes.study.space import draw_settings
 
 HERE = Path(__file__).parents[1]
 OUT = HERE / "results" / "population"
+OTHERS = Path(__file__).with_name("other_libraries.py")
 SPACE = OmegaConf.to_container(OmegaConf.load(HERE.parent / "configs" / "search" / "wam.yaml"))["space"]
 EVERY, EVALUATIONS = 20_000, 50  # steps between evaluations, evaluations in 1,000,000 steps
 QUIET = ["evaluation.video=false", "run.wandb=false", "run.checkpoint_every=${algo.total_frames}"]
@@ -68,57 +70,66 @@ LENGTHS = {"search": (400, 2_000), "paper": (200, 800), "ppo": (2_048, 4_096)}  
 COLUMNS = ("setting", "who", "learners", "bfloat16", "round", "core_seconds", "evaluations", "memory")
 MEAN_BATCH = 144  # of Table 2
 PLAN = {
-    "search": [(count, half) for half in (False, True) for count in (1, 4, 16, 64)],
+    "search": [(1, False), (16, False), *((count, True) for count in (1, 4, 16, 64, 256))],
     "paper": [(1, False), (1, True), (4, True), (16, True)],
-    "ppo": [(1, False), (4, False), (16, False), (64, False)],
+    "ppo": [(count, False) for count in (1, 4, 16, 64, 256)],
 }
 
 
-def drawn(learner: int, learners: int) -> dict[str, object]:
-    """A draw from Table 2 for one learner of a pack, which has the draws with batch sizes nearest to the mean."""
+def drawn(learners: int) -> list[dict[str, Any]]:
+    """Draws from Table 2 for a pack's learners: of many, those with batch sizes nearest to the mean."""
     many = [draw_settings(SPACE, 0, number, "nht") for number in range(8 * learners)]
     many.sort(key=lambda one: abs(one["algo.batch_size"] - MEAN_BATCH))
-    return {name: value for name, value in many[learner].items() if name.startswith("algo.")}
-
-
-def overrides(setting: str, learner: int, learners: int, folder: Path) -> list[str]:
-    """The overrides of one learner."""
-    told = [*SETTINGS[setting], *QUIET, f"seed={learner}", f"run.folder={folder}/{learner}"]
-    if setting == "ppo":
-        return told
-    told.append(f"map.file={folder}/map.safetensors")
-    if setting == "search":
-        told += [f"{name}={value}" for name, value in drawn(learner, learners).items()]
-    return told
+    return [
+        {name.removeprefix("algo."): value for name, value in one.items() if name.startswith("algo.")}
+        for one in many[:learners]
+    ]
 
 
 def train(setting: str, learners: int, half: bool, steps: int, every: int) -> float:
     """Processor seconds of a run."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
+        configs = configured(
+            setting, learners, folder, [f"algo.total_frames={steps}", f"evaluation.every={every}"], half
+        )
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            began = time.process_time()
+            together = str(folder / "together") if learners > 1 else None
+            find_algorithm(algorithm(setting)).train(*configs, together=together)
+            return time.process_time() - began
+
+
+def algorithm(setting: str) -> str:
+    """What learns in a setting."""
+    return "ppo" if setting == "ppo" else "ddpg"
+
+
+def configured(setting: str, learners: int, folder: Path, more: list[str], half: bool) -> list[Training]:
+    """The settings of every learner."""
+    told = [*SETTINGS[setting], *QUIET, *more, f"run.folder={folder}/none"]
+    if setting != "ppo":
         map = nht.NHT(10, 7, 2, hidden=(64, 64)).eval()
         map.context_keys = ("tool_position", "joint_angle")
         nht.save_map(map, folder / "map.safetensors")
-        algorithm = find_algorithm("ppo" if setting == "ppo" else "ddpg")
-        more = [f"algo.total_frames={steps}", f"evaluation.every={every}"]
-        more += [f"algo.bfloat16={half}"] if setting != "ppo" else []
-        configs = [
-            configure(
-                algorithm.schema,
-                "ppo" if setting == "ppo" else "ddpg",
-                [*overrides(setting, learner, learners, folder), *more],
-            )
-            for learner in range(learners)
-        ]
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            began = time.process_time()
-            algorithm.train(*configs, together=str(folder / "together") if learners > 1 else None)
-            return time.process_time() - began
+        told += [f"map.file={folder}/map.safetensors", f"algo.bfloat16={half}"]
+    base = configure(find_algorithm(algorithm(setting)).schema, algorithm(setting), told)
+    draws = drawn(learners) if setting == "search" else learners * [{}]
+    return [
+        replace(
+            deepcopy(base),
+            algo=replace(base.algo, **own),
+            seed=seed,
+            run=replace(base.run, folder=str(folder / str(seed))),
+        )
+        for seed, own in enumerate(draws)
+    ]
 
 
 def cost(setting: str, learners: int, half: bool) -> dict[str, float]:
     """Core-seconds per learner and 1,000,000 steps, and the largest memory [MB]."""
-    short, long = LENGTHS[setting]
+    few = max(1, 16 // learners)  # whose runs are longer: starting takes seconds, and not always as many
+    short, long = (few * steps for steps in LENGTHS[setting])
     train(setting, learners, half, short, short)  # warm-up
     before, after = (train(setting, learners, half, steps, steps) for steps in (short, long))
     often = train(setting, learners, half, long, short)
@@ -129,73 +140,39 @@ def cost(setting: str, learners: int, half: bool) -> dict[str, float]:
     return {"core_seconds": million, "evaluations": a_test * EVALUATIONS / learners, "memory": memory}
 
 
-def baseline(setting: str, copies: int) -> dict[str, float]:
-    """stable-baselines3's core-seconds per 1,000,000 steps, without evaluations."""
-    if setting == "ppo":
-        env = VecNormalize(DummyVecEnv([lambda: gymnasium.make("HalfCheetah-v5")] * copies), gamma=0.99)
-        steps, hidden = 2_048, {"net_arch": [64, 64]}
-        model = stable_baselines3.PPO(
-            "MlpPolicy",
-            env,
-            n_steps=steps // copies,
-            batch_size=64,
-            policy_kwargs=hidden,
-            device="cpu",
-            seed=0,
-        )
+def measured(
+    who: str, setting: str, learners: int, half: bool, pythons: dict[str, list[str]]
+) -> dict[str, float]:
+    """A measurement in a process of its own; of another library in the Python that has it."""
+    if who == "nht":
+        command = [sys.executable, __file__, "measure", setting, str(learners), str(half)]
     else:
-        make = partial(gymnasium.make, "nht.envs:nht/WAMWipe-v0")
-        env, motors = DummyVecEnv([make] * copies), 7
-        per_update = 10 if setting == "search" else 5
-        steps = {"search": 2_000, "paper": 500}[setting]
-        model = stable_baselines3.DDPG(
-            "MlpPolicy",
-            env,
-            learning_starts=0,
-            buffer_size=100_000,
-            batch_size=MEAN_BATCH if setting == "search" else 256,
-            train_freq=max(1, per_update // copies),
-            gradient_steps=max(1, copies // per_update),
-            action_noise=NormalActionNoise(np.zeros(motors), 0.1 * np.ones(motors)),
-            policy_kwargs={"net_arch": [128, 128] if setting == "search" else [256, 256, 256]},
-            device="cpu",
-            seed=0,
-        )
-    model.learn(steps, reset_num_timesteps=False)
-    began = time.process_time()
-    model.learn(steps, reset_num_timesteps=False)
-    return {"core_seconds": (time.process_time() - began) / steps * 1e6, "evaluations": 0.0, "memory": 0.0}
-
-
-def apart(*words: object) -> dict[str, float]:
-    """A measurement in a process of its own."""
-    command = [sys.executable, __file__, "measure", *map(str, words)]
+        python, *checkout = pythons.get(who, [sys.executable])
+        command = [python, str(OTHERS), who, setting, *(checkout or [str(learners)])]
     found = subprocess.run(command, capture_output=True, text=True)
     if found.returncode:
         raise RuntimeError(found.stderr)
     return json.loads(found.stdout.strip().splitlines()[-1])
 
 
-def benchmark(chosen: list[str], rounds: int) -> None:
+def benchmark(chosen: list[str], rounds: int, pythons: dict[str, list[str]]) -> None:
     """All measurements in turn, round after round."""
     plan: list[tuple[str, str, int, bool]] = []
     for setting in chosen:
         plan += [(setting, "nht", learners, half) for learners, half in PLAN[setting]]
-        plan += [
-            (setting, "stable-baselines3", copies, False) for copies in (1, 10 if setting != "ppo" else 16)
-        ]
+        for who in ("stable-baselines3", *pythons):
+            many = 16 if setting == "ppo" else 10
+            plan += [(setting, who, copies, False) for copies in ((1,) if who == "cleanrl" else (1, many))]
     OUT.mkdir(parents=True, exist_ok=True)
     file = OUT / "rounds.csv"
     fresh = not file.exists()
     with file.open("a", newline="") as handle:
         writer = csv.writer(handle)
         if fresh:
-            writer.writerow(
-                ("setting", "who", "learners", "bfloat16", "round", "core_seconds", "evaluations", "memory")
-            )
+            writer.writerow(COLUMNS)
         for number in range(rounds):
             for setting, who, learners, half in plan:
-                found = apart(who, setting, learners, half)
+                found = measured(who, setting, learners, half, pythons)
                 writer.writerow(
                     (setting, who, learners, half, number, *(round(v, 2) for v in found.values()))
                 )
@@ -206,34 +183,41 @@ def benchmark(chosen: list[str], rounds: int) -> None:
 
 
 def show(file: Path) -> None:
-    """Medians and spreads."""
-    with file.open() as handle:
-        rows = list(csv.DictReader(handle))
-    groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
-    for row in rows:
-        groups.setdefault((row["setting"], row["who"], row["learners"], row["bfloat16"]), []).append(row)
-    print(
-        "| setting | who | learners | bfloat16 | core-seconds per learner and 1M steps | of them evaluations | memory |"
-    )
-    print("|---|---|---|---|---|---|---|")
-    for key, found in groups.items():
-        costs = [float(row["core_seconds"]) for row in found]
-        tests, memory = (
-            statistics.median(float(row[name]) for row in found) for name in ("evaluations", "memory")
-        )
-        spread = f"{statistics.median(costs):.0f} ({min(costs):.0f} .. {max(costs):.0f})"
-        print("| " + " | ".join([*key, spread, f"{tests:.0f}", f"{memory:.0f} MB"]) + " |")
+    """Medians and spreads as a table, and how cost and memory grow with the learners."""
+    rows = pandas.read_csv(file)
+    groups = rows.groupby(["setting", "who", "learners", "bfloat16"])
+    table = groups["core_seconds"].agg(["median", "min", "max", "count"])
+    table["of them evaluations"] = groups["evaluations"].median()
+    table["memory [MB]"] = groups["memory"].median()
+    print(table.round(0).to_string())
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5))
+    for (setting, half), own in rows[rows["who"] == "nht"].groupby(["setting", "bfloat16"]):
+        medians = own.groupby("learners")[["core_seconds", "memory"]].median()
+        if len(medians) > 2:
+            label = f"{setting}{', bfloat16' if half else ''}"
+            left.plot(medians.index, medians["core_seconds"] * medians.index, "o-", label=label)
+            right.plot(medians.index, medians["memory"], "o-", label=label)
+    left.set(xscale="log", yscale="log", xlabel="learners", ylabel="core-seconds for 1,000,000 steps of each")
+    right.set(xscale="log", yscale="log", xlabel="learners", ylabel="memory of the process [MB]")
+    left.legend()
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(OUT / "growth.png", dpi=120)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Measure everything that was asked for, or one population."""
     torch.set_num_threads(1)
     words = sys.argv[1:]
     if words[:1] == ["measure"]:
-        _, who, setting, learners, half = words
-        measured = (
-            cost(setting, int(learners), half == "True") if who == "nht" else baseline(setting, int(learners))
-        )
-        print(json.dumps(measured))
-    else:
-        given = [int(word.partition("=")[2]) for word in words if word.startswith("rounds=")]
-        benchmark([word for word in words if word in PLAN] or list(PLAN), given[0] if given else 3)
+        _, setting, learners, half = words
+        print(json.dumps(cost(setting, int(learners), half == "True")))
+        return
+    told = dict(word.split("=", 1) for word in words if "=" in word)
+    pythons = {who: told[who].split(":") for who in ("sbx", "cleanrl") if who in told}
+    benchmark([word for word in words if word in PLAN] or list(PLAN), int(told.get("rounds", 3)), pythons)
+
+
+if __name__ == "__main__":
+    main()

@@ -33,8 +33,8 @@ class LearnersAdam(torch.optim.Adam):
                 continue
             moves = [nn.Parameter(torch.zeros_like(parameter)) for parameter in own]
             groups.append({"params": moves, "lr": 1.0})
-            rates = rate.clone()
-            self._apart += [(each, move, beside(rates, each)) for each, move in zip(own, moves, strict=True)]
+            for each, move in zip(own, moves, strict=True):
+                self._apart.append((each, move, rate.view(-1, *[1] * (each.ndim - 1))))
         graphed = groups[0]["params"][0].is_cuda  # the step must be one that a CUDA graph can repeat
         if graphed:
             groups = [{**group, "lr": torch.tensor(group["lr"], device="cuda")} for group in groups]

@@ -109,9 +109,10 @@ def storable(steps: TensorDictBase) -> TensorDictBase:
     if steps.ndim == 3:
         return steps.select(*STORED).flatten(1, 2).transpose(0, 1)
     flat = steps.reshape(-1).select(*STORED)
-    return flat[
+    finite = (
         flat["action"].isfinite().all(-1).nonzero().squeeze(-1)
-    ]  # a mask is waited for at every entry
+    )  # a GPU waits once, with a mask at every entry
+    return flat[finite]
 
 
 class DemosBuffer(NamedTuple):

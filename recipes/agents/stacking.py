@@ -27,7 +27,10 @@ class StackedLinear(nn.Module):
     def forward(self, inputs: Tensor) -> Tensor:
         """``(L, *batch, in)`` to ``(L, *batch, out)``."""
         rows = inputs.flatten(1, -2)
-        product = torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight.mT)
+        if self.weight.shape[1] == 1:  # for which a matrix product takes twice as long
+            product = (rows * self.weight).sum(-1, keepdim=True) + self.bias.unsqueeze(1)
+        else:
+            product = torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight.mT)
         return product.view(*inputs.shape[:-1], -1)
 
 
