@@ -19,6 +19,7 @@ from nht.recipes.data.recording import record_expert
 from nht.recipes.launch import configure
 from nht.recipes.run.demonstrations import demo_steps, demonstrated
 from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.memory import replay_bytes
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.sections import DemosConfig, EnvConfig
 
@@ -123,6 +124,12 @@ def test_targets_look_ahead_within_an_episode(demos: Path) -> None:
         assert int(rows["steps_to_next_obs"][step]) == last + 1 - step
         assert rows["next", "observation"][step].equal(data["next", "observation"][last])
         assert bool(rows["next", "terminated"][step]) == bool(data["terminated"][last])
+
+
+def test_they_are_part_of_the_memory_that_learners_need(demos: Path) -> None:
+    without = replay_bytes(config(demos, "algo.demos.transitions=0"))
+    steps = 1_000  # of tiny_runs's buffer
+    assert replay_bytes(config(demos)) == pytest.approx(without * (steps + COUNT) / steps)
 
 
 # Bad input. Nothing is trained, and nothing is left behind.
