@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from nht.recipes.agents.adam import LearnersAdam
+from nht.recipes.agents.cloning import cloning_of
 from nht.recipes.agents.ddpg import DDPG, PaperDDPGLoss, networks
 from nht.recipes.agents.off_policy import (
     JointSoftUpdate,
@@ -21,6 +22,7 @@ from nht.recipes.agents.off_policy import (
     replay_buffer,
     storable,
 )
+from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
@@ -47,7 +49,10 @@ def main(*configs: DDPG, together: str | None = None) -> None:
     features, actor, critic = learners.networks(partial(networks, envs.train))
     policy = TensorDictSequential(features, actor)
     rewards = reward_range(envs.train)
-    loss = PaperDDPGLoss(actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards)
+    cloning = cloning_of(algo.demos, ranks.device)
+    loss = PaperDDPGLoss(
+        actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards, cloning=cloning
+    )
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
     optimiser = LearnersAdam(
@@ -56,7 +61,12 @@ def main(*configs: DDPG, together: str | None = None) -> None:
             (loss.value_network_params.values(True, True), algo.critic_learning_rate),
         ]
     )
+
+    def rows(steps: TensorDictBase) -> TensorDictBase:
+        return storable(look_ahead(charge_failure(steps, algo.gamma, rewards)))
+
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
+    demos = replay_demos(folder, ranks, buffer, features, rows)
 
     @graphed(ranks)
     def update(batch: TensorDictBase) -> TensorDictBase:
@@ -83,11 +93,13 @@ def main(*configs: DDPG, together: str | None = None) -> None:
         for data in batches:  # (copies, steps), or (learners, copies, steps)
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
-            buffer.extend(storable(look_ahead(charge_failure(data, algo.gamma, rewards))))
+            buffer.extend(rows(data))
+            if cloning is not None:
+                cloning.fade(record.frames)
 
             if record.frames >= algo.warmup_frames:
                 for batch in minibatches(
-                    buffer, algo.updates_per_batch, batch_size, features, ranks.device, learners.draws
+                    buffer, algo.updates_per_batch, batch_size, features, ranks.device, learners.draws, demos
                 ):
                     record.count_update(update(batch))
                     if record.counters.updates % algo.target_update_every == 0:

@@ -63,7 +63,11 @@ def _rules(recipe: str) -> list[str]:
 def _settings(prefix: str, schema: type[Any], values: Mapping[str, Any]) -> Iterator[str]:
     """One line per setting: name, value, meaning."""
     found = meanings(schema)
+    sections = {entry.name: section(entry) for entry in fields(schema)}
     for name, value in values.items():
+        if (kind := sections.get(name)) is not None:
+            yield from _settings(f"{prefix}{name}.", kind, value)
+            continue
         setting = f"  {prefix}{name}={as_typed(value)}"
         meaning = found.get(name, "")
         if len(setting) > 44 and meaning:

@@ -243,8 +243,8 @@ def _existing(schema: type[Any], error: HydraException | OmegaConfBaseException)
     key = unknown_key(error)
     if key is None:
         return listed_choices(error)
-    node: Any = schema()
+    node: Any = schema  # never made: its own defaults may not go together, only those of its YAML do
     for part in key.split(".")[:-1]:
-        node = getattr(node, part, node)
-    names = [entry.name for entry in fields(node)] if is_dataclass(node) else []
+        node = next((kind for entry in fields(node) if entry.name == part and (kind := section(entry))), node)
+    names = [entry.name for entry in fields(node)]
     return f". Keys here: {names}." if names else ""

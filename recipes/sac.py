@@ -6,9 +6,11 @@ python -m nht.recipes.sac env=half_cheetah map=none seed=0
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from nht.recipes.agents.off_policy import JointSoftUpdate, descend, minibatches, replay_buffer, storable
+from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.agents.sac import SAC, DirectSACLoss, networks
 from nht.recipes.launch import launch
@@ -51,7 +53,12 @@ def main(config: SAC) -> None:
         ],
         fused=True,
     )
+
+    def rows(steps: TensorDictBase) -> TensorDictBase:
+        return storable(look_ahead(charge_failure(steps, algo.gamma, rewards)))
+
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
+    demos = replay_demos(folder, ranks, buffer, features, rows)
     batch_size = ranks.share("algo.batch_size", algo.batch_size)
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     loop = Loop(folder, ranks, envs, record, policy, loss, random_frames=algo.random_frames, **parts)
@@ -60,10 +67,12 @@ def main(config: SAC) -> None:
         for data in batches:  # (copies, steps)
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
-            buffer.extend(storable(look_ahead(charge_failure(data, algo.gamma, rewards))))
+            buffer.extend(rows(data))
 
             if record.frames >= algo.warmup_frames:
-                for batch in minibatches(buffer, algo.updates_per_batch, batch_size, features, ranks.device):
+                for batch in minibatches(
+                    buffer, algo.updates_per_batch, batch_size, features, ranks.device, demos=demos
+                ):
                     losses = loss(batch)
                     descend(
                         [losses["loss_actor"], losses["loss_qvalue"], losses["loss_alpha"]],

@@ -55,6 +55,25 @@ class DemosConfig:
 
 
 @dataclass
+class ReplayDemosConfig:
+    """Which of the run's demonstrations an algorithm with a replay buffer learns from, too."""
+
+    transitions: int = 0  # how many, from the first on; 0 is none
+    share: float = 0.0  # of each minibatch, from a buffer of their own; 0 puts them into the replay buffer
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a number or share that is none."""
+        if self.transitions < 0:
+            raise ValueError(f"algo.demos.transitions must be at least 0, got {self.transitions}.")
+        if not 0 <= self.share < 1:
+            raise ValueError(f"algo.demos.share must lie in [0, 1), got {self.share}.")
+        if self.share and not self.transitions:
+            raise ValueError(
+                f"algo.demos.share={self.share} is a share of demonstrations: set algo.demos.transitions, too."
+            )
+
+
+@dataclass
 class SourceConfig:
     """Where ``collect_demos`` takes demonstrations from. Keys may be nested: ``info/goal``."""
 

@@ -6,8 +6,10 @@ python -m nht.recipes.td3 env=half_cheetah map=none seed=0
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
+from nht.recipes.agents.cloning import cloning_of
 from nht.recipes.agents.off_policy import (
     JointSoftUpdate,
     descend,
@@ -16,6 +18,7 @@ from nht.recipes.agents.off_policy import (
     replay_buffer,
     storable,
 )
+from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.agents.td3 import TD3, DirectTD3Loss, networks
 from nht.recipes.launch import launch
@@ -40,6 +43,7 @@ def main(config: TD3) -> None:
     policy = TensorDictSequential(features, actor)
 
     rewards = reward_range(envs.train)
+    cloning = cloning_of(algo.demos, ranks.device)
     loss = DirectTD3Loss(
         actor,
         critic,
@@ -47,6 +51,7 @@ def main(config: TD3) -> None:
         policy_noise=algo.policy_noise,
         noise_clip=algo.noise_clip,
         reward_range=rewards,
+        cloning=cloning,
     )
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)
@@ -57,7 +62,12 @@ def main(config: TD3) -> None:
         ],
         fused=True,
     )
+
+    def rows(steps: TensorDictBase) -> TensorDictBase:
+        return storable(look_ahead(charge_failure(steps, algo.gamma, rewards)))
+
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
+    demos = replay_demos(folder, ranks, buffer, features, rows)
     batch_size = ranks.share("algo.batch_size", algo.batch_size)
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     explorer = exploring(policy, envs.train, algo)
@@ -67,10 +77,14 @@ def main(config: TD3) -> None:
         for data in batches:  # (copies, steps)
             record.count_steps(data)
             features.module.update(data["observation"], ranks.sum)
-            buffer.extend(storable(look_ahead(charge_failure(data, algo.gamma, rewards))))
+            buffer.extend(rows(data))
+            if cloning is not None:
+                cloning.fade(record.frames)
 
             if record.frames >= algo.warmup_frames:
-                for batch in minibatches(buffer, algo.updates_per_batch, batch_size, features, ranks.device):
+                for batch in minibatches(
+                    buffer, algo.updates_per_batch, batch_size, features, ranks.device, demos=demos
+                ):
                     actor_too = (record.counters.updates + 1) % algo.policy_delay == 0
                     losses = loss(batch, actor=actor_too)
                     descend([losses["loss_actor"], losses["loss_qvalue"]], optimiser, ranks)

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 from torchrl.objectives import DDPGLoss
 
+from nht.recipes.agents.cloning import ClonedDemosConfig, Cloning
 from nht.recipes.agents.critics import critic_network
 from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig, mean_over
@@ -50,6 +51,7 @@ class DDPGConfig(OffPolicyConfig):
     exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
     noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
     random_action: float = 0.1  # probability of a uniform action instead
+    demos: ClonedDemosConfig = field(default_factory=ClonedDemosConfig)  # to learn from, too
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""
@@ -102,6 +104,7 @@ class PaperDDPGLoss(DDPGLoss):
         action_l2: weight of the mean squared action in the actor's loss.
         reward_range: smallest and largest reward of a step, infinite where unknown; targets are clipped to the
             returns that these allow.
+        cloning: a further term of the actor's loss, of demonstrated steps; None is none.
     """
 
     def __init__(
@@ -112,9 +115,11 @@ class PaperDDPGLoss(DDPGLoss):
         gamma: Setting,
         action_l2: Setting,
         reward_range: Range = UNBOUNDED,
+        cloning: Cloning | None = None,
     ) -> None:
         super().__init__(actor_network, value_network, delay_actor=True, delay_value=True)
         self.gamma, self.action_l2 = gamma, action_l2
+        self.__dict__["_cloning"] = cloning
         self.returns = return_range(reward_range, gamma)
         actor, critic = actor_network.module, value_network.module
         target_actor, target_critic = deepcopy(actor), deepcopy(critic)
@@ -138,11 +143,17 @@ class PaperDDPGLoss(DDPGLoss):
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, a scalar; its gradient leaves the critic alone."""
         actor, critic, _, _ = self._networks
-        action = actor(tensordict["features"])
+        features = tensordict["features"]
+        action = actor(features)
         critic.requires_grad_(False)
-        value = critic(tensordict["features"], action)
+        value = critic(features, action)
         critic.requires_grad_(True)
-        return self.action_l2 * mean_over(tensordict, action.square()) - mean_over(tensordict, value), {}
+        loss = self.action_l2 * mean_over(tensordict, action.square()) - mean_over(tensordict, value)
+        if self._cloning is not None:
+            loss = loss + self._cloning.loss(
+                tensordict, action, value.squeeze(-1), lambda shown: critic(features, shown).squeeze(-1)
+            )
+        return loss, {}
 
 
 def policy(env: EnvBase, algo: DDPGConfig) -> TensorDictModule:

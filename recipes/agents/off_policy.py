@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -19,7 +19,7 @@ from torchrl.objectives.common import LossModule
 from nht.recipes.agents.settings import Setting, beside, largest
 from nht.recipes.run.draws import Draws
 from nht.recipes.run.ranks import Ranks
-from nht.recipes.sections import AlgoConfig
+from nht.recipes.sections import AlgoConfig, ReplayDemosConfig
 from nht.recipes.torch_internals import lerp_all
 from nht.recipes.torchrl_internals import followed_pairs
 
@@ -54,6 +54,7 @@ class OffPolicyConfig(AlgoConfig):
     pessimism: float = 0.8  # the critics start at this times the lowest return that is possible
     observation_clip: float = 5.0  # of the normalised observation
     bfloat16: bool = False  # the precision of hidden layers' matrix products; weights stay float32
+    demos: ReplayDemosConfig = field(default_factory=ReplayDemosConfig)  # demonstrations to learn from, too
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""
@@ -64,6 +65,20 @@ class OffPolicyConfig(AlgoConfig):
         counts = ("total_frames", "frames_per_batch", "n_steps", "batch_size", "buffer_size")
         self._check_least(1, *counts)
         self._check_least(0, "updates_per_batch", "warmup_frames", "random_frames")
+        self._check_demos()
+
+    def _check_demos(self) -> None:
+        transitions, share = self.demos.transitions, self.demos.share
+        if share and not 0 < round(share * self.batch_size) < self.batch_size:
+            raise ValueError(
+                f"algo.demos.share={share} of algo.batch_size={self.batch_size} leaves demonstrations or collected "
+                "steps without a place."
+            )
+        if not share and transitions > self.buffer_size:
+            raise ValueError(
+                f"algo.demos.transitions={transitions} must be at most algo.buffer_size={self.buffer_size}, which they "
+                "go into unless algo.demos.share is set."
+            )
 
     def _check_unit(self, *names: str) -> None:
         for name in names:
@@ -100,6 +115,17 @@ def storable(steps: TensorDictBase) -> TensorDictBase:
     return flat[finite]
 
 
+class DemosBuffer(NamedTuple):
+    """Demonstrations that have a fixed share of every minibatch."""
+
+    buffer: TensorDictReplayBuffer
+    share: float
+
+    def count(self, batch_size: int) -> int:
+        """How many steps of a minibatch are demonstrated: at least one, and not all."""
+        return min(max(1, round(self.share * batch_size)), batch_size - 1)
+
+
 def minibatches(
     buffer: TensorDictReplayBuffer,
     updates: int,
@@ -107,6 +133,7 @@ def minibatches(
     features: TensorDictModule,
     device: torch.device,
     draws: Draws | None = None,
+    demos: DemosBuffer | None = None,
 ) -> Iterator[TensorDictBase]:
     """``updates`` minibatches ``(batch_size,)``, drawn at once and normalised by today's statistics.
 
@@ -118,15 +145,23 @@ def minibatches(
         device: where the networks are.
         draws: of several learners: minibatches are ``(L, B)`` then. Those of fewer steps are filled up to the largest,
             and a ``"weight"`` says what a step counts for.
+        demos: demonstrations, which have their share of every minibatch; ``"demonstrated"`` then says what a step
+            counts for in a mean over them, 0 for a collected one. None is none.
     """
     if not updates:
         return
     if draws is not None:
         assert not isinstance(batch_size, int)
-        yield from _minibatches_of_each(buffer, updates, batch_size, features, device, draws)
+        yield from _minibatches_of_each(buffer, updates, batch_size, features, device, draws, demos)
         return
     assert isinstance(batch_size, int)
-    replay = buffer.sample(updates * batch_size).to(device)
+    shown = 0 if demos is None else demos.count(batch_size)
+    replay = buffer.sample(updates * (batch_size - shown)).to(device)
+    if demos is not None:
+        parts = replay, demos.buffer.sample(updates * shown).to(device)
+        mixed: Any = torch.cat([part.view(updates, -1) for part in parts], dim=1)
+        mixed["demonstrated"] = _demonstrated([batch_size], [shown], device).expand(updates, -1)
+        replay = mixed.reshape(-1)
     with torch.no_grad():
         features(replay), features(replay["next"])
     yield from replay.split(batch_size)
@@ -139,23 +174,57 @@ def _minibatches_of_each(
     features: TensorDictModule,
     device: torch.device,
     draws: Draws,
+    demos: DemosBuffer | None,
 ) -> Iterator[TensorDictBase]:
-    learners, width = len(sizes), max(sizes)
-    rows = buffer.storage[: len(buffer)].reshape(-1)  # of all learners, in turn
-    drawn = draws.integers(len(buffer), [updates * size for size in sizes])
-    # What fills a minibatch up is a learner's own step: a weight of 0 makes nothing of another's NaN.
-    places = torch.arange(learners, device=device).view(-1, 1, 1).repeat(1, updates, width)
-    for learner, (size, own) in enumerate(zip(sizes, drawn, strict=True)):
-        places[learner, :, :size] += own.view(updates, size) * learners
-    counts = torch.tensor(sizes, device=device).unsqueeze(-1)
-    weight = (torch.arange(width, device=device) < counts) / counts
+    shown = [0 if demos is None else demos.count(size) for size in sizes]
+    sources = [(buffer, [size - own for size, own in zip(sizes, shown, strict=True)])]
+    if demos is not None:
+        sources.append((demos.buffer, shown))
+    rows = [source.storage[: len(source)].reshape(-1) for source, _ in sources]  # of all learners, in turn
+    drawn = [_places(draws, len(source), counts, updates, device) for source, counts in sources]
+    total = torch.tensor(sizes, device=device).unsqueeze(-1)
+    weight = torch.cat([_filled(counts, device) for _, counts in sources], dim=-1) / total
+    demonstrated = None if demos is None else _demonstrated(sizes, shown, device)
     # One at a time stays in a processor's cache; a GPU would rather have few large calls.
-    for chosen in places.split(updates if rows.device.type == "cuda" else 1, dim=1):
-        replay = rows[chosen.flatten()].view(chosen.shape).to(device)
+    for places in zip(
+        *(part.split(updates if device.type == "cuda" else 1, dim=1) for part in drawn), strict=True
+    ):
+        parts = [
+            source[chosen.flatten()].view(chosen.shape).to(device)
+            for source, chosen in zip(rows, places, strict=True)
+        ]
+        replay: Any = parts[0] if demos is None else torch.cat(parts, dim=2)
         with torch.no_grad():
             features(replay), features(replay["next"])
         for batch in replay.unbind(1):
-            yield batch if min(sizes) == width else batch.set("weight", weight)
+            if demonstrated is not None:
+                batch["demonstrated"] = demonstrated
+            yield batch if min(sizes) == max(sizes) else batch.set("weight", weight)
+
+
+def _places(draws: Draws, high: int, counts: Sequence[int], updates: int, device: torch.device) -> Tensor:
+    """For each learner the places of its steps in rows of all learners, ``(L, updates, max(counts))``.
+
+    What fills a minibatch up is a learner's own step: a weight of 0 makes nothing of another's NaN.
+    """
+    learners = len(counts)
+    places = torch.arange(learners, device=device).view(-1, 1, 1).repeat(1, updates, max(counts))
+    drawn = draws.integers(high, [updates * count for count in counts])
+    for learner, (count, own) in enumerate(zip(counts, drawn, strict=True)):
+        places[learner, :, :count] += own.view(updates, count) * learners
+    return places
+
+
+def _filled(counts: Sequence[int], device: torch.device) -> Tensor:
+    """Which steps count, ``(L, max(counts))``: each learner's first ones."""
+    return torch.arange(max(counts), device=device) < torch.tensor(counts, device=device).unsqueeze(-1)
+
+
+def _demonstrated(sizes: Sequence[int], shown: Sequence[int], device: torch.device) -> Tensor:
+    """What steps count for in a mean over the demonstrated ones, which stand behind the others, ``(L, width)``."""
+    counts, total = (torch.tensor(numbers, device=device).unsqueeze(-1) for numbers in (shown, sizes))
+    collected = max(size - own for size, own in zip(sizes, shown, strict=True))
+    return torch.nn.functional.pad(_filled(shown, device) * total / counts, (collected, 0))
 
 
 def mean_over(batch: TensorDictBase, values: Tensor) -> Tensor:

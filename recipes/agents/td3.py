@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 from torchrl.objectives import TD3Loss
 
+from nht.recipes.agents.cloning import ClonedDemosConfig, Cloning
 from nht.recipes.agents.critics import CriticPair, critic_network
 from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig
@@ -35,6 +36,7 @@ class TD3Config(OffPolicyConfig):
     exploration_noise: float = 0.1  # standard deviation; actions lie in [-1, 1]
     noise_memory: float = 1.0  # steps after which the noise has forgotten itself; 1 is white noise
     random_action: float = 0.0  # probability of a uniform action instead
+    demos: ClonedDemosConfig = field(default_factory=ClonedDemosConfig)  # to learn from, too
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""
@@ -87,6 +89,7 @@ class DirectTD3Loss(TD3Loss):
         policy_noise: deviation of the noise on the target's action.
         noise_clip: largest absolute value of that noise.
         reward_range: smallest and largest reward of a step, infinite where unknown.
+        cloning: a further term of the actor's loss, of demonstrated steps; None is none.
         draw: returns standard normal noise in the shape of a tensor.
     """
 
@@ -101,6 +104,7 @@ class DirectTD3Loss(TD3Loss):
         policy_noise: float = 0.2,
         noise_clip: float = 0.5,
         reward_range: Range = UNBOUNDED,
+        cloning: Cloning | None = None,
         draw: Callable[[Tensor], Tensor] = torch.randn_like,
     ) -> None:
         super().__init__(
@@ -112,6 +116,7 @@ class DirectTD3Loss(TD3Loss):
             loss_function="l2",
         )
         self._discount, self._draw = gamma, draw
+        self.__dict__["_cloning"] = cloning
         self._returns = return_range(reward_range, gamma)
         parts = dict(self.named_children())
         actor, critic = actor_network.module, qvalue_network.module
@@ -146,8 +151,14 @@ class DirectTD3Loss(TD3Loss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, a scalar; its gradient leaves the critics alone."""
         features = tensordict["features"]
-        value = self._critics.fixed(features, self._actors[0](features), critics=1)
-        return -value.mean(), {"state_action_value_actor": value.detach()}
+        action = self._actors[0](features)
+        value = self._critics.fixed(features, action, critics=1)
+        loss = -value.mean()
+        if self._cloning is not None:
+            loss = loss + self._cloning.loss(
+                tensordict, action, value[0], lambda shown: self._critics.fixed(features, shown, critics=1)[0]
+            )
+        return loss, {"state_action_value_actor": value.detach()}
 
 
 def policy(env: EnvBase, algo: TD3Config) -> TensorDictModule:

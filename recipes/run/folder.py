@@ -20,6 +20,7 @@ from nht.recipes.agents.table import name_of
 from nht.recipes.maps.interface import run_map
 from nht.recipes.maps.kinds import default_scale, map_context_keys
 from nht.recipes.run.dashboard import Dashboard, open_dashboard, wanted
+from nht.recipes.run.demonstrations import DEMOS_FOLDER, note_demos, provide_demos
 from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
 from nht.recipes.run.metrics_file import read_metrics
@@ -76,6 +77,7 @@ class RunFolder:
         self._started = time.perf_counter()
         self._open = ExitStack()
         self._dashboard: Dashboard | None = None
+        self._noted: dict[str, float] = {}
         if ranks.first:
             with ExitStack() as undo:
                 self._begin(undo)
@@ -108,13 +110,19 @@ class RunFolder:
         if not self.resuming:
             undo.callback(settings.unlink, missing_ok=True)
         self._write_config()
+        if not (recorded := self.path / DEMOS_FOLDER).exists():
+            undo.callback(shutil.rmtree, recorded, ignore_errors=True)
+        told = provide_demos(self.config, self.resuming)
         if not (kept := self.path / MAP_FILE).exists():
-            map, found = self._make_map(self.config, motors)
+            map, found = self._make_map(told, motors)
             mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
             if found:
                 with replacing(self.path / MAP_METRICS_FILE) as scratch:
                     scratch.write_text(json.dumps(found))
+            self._noted = note_demos(self.config, map)
             nht.save_map(map, kept)
+        else:
+            self._noted = note_demos(self.config, kept_map(self.path, self.config, allow=self._named()))
         self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
 
     def _look(self) -> None:
@@ -188,7 +196,7 @@ class RunFolder:
         """Append a row to ``metrics.csv`` and send it to W&B, against environment steps."""
         if not self._ranks.first:
             return
-        row = {FRAMES: frames, **row, SECONDS: time.perf_counter() - self._started}
+        row = {FRAMES: frames, **row, **self._noted, SECONDS: time.perf_counter() - self._started}
         fresh = not self.metrics.exists()
         with self.metrics.open("a", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=list(row))

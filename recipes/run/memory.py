@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+from nht.recipes.run.demonstrations import transitions_asked
 from nht.recipes.run.environments import base_env
 from nht.recipes.sections import Training
 
@@ -33,10 +34,11 @@ def check_memory(configs: Sequence[Training]) -> None:
 
 
 def replay_bytes(config: Training) -> int:
-    """Size of one learner's full replay buffer [bytes]; 0 for an algorithm without one."""
+    """Size of one learner's full replay buffer, demonstrations included [bytes]; 0 for an algorithm without one."""
     steps = min(getattr(config.algo, "buffer_size", 0), config.algo.total_frames)
     if not steps:
         return 0
+    steps += transitions_asked(config)
     env = base_env(config.env, seed=0, num_envs=1)
     numbers = 2 * env.observation_spec["observation"].shape[-1] + env.action_spec.shape[-1] + 1
     env.close()

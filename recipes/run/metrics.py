@@ -7,6 +7,8 @@ SUCCESS, FAILURE, RETURN = "success", "failure", "return"
 EPISODE_OUTCOMES = (SUCCESS, FAILURE, RETURN)
 """The outcomes of an episode."""
 DIVERGED, CLIPPED = "diverged", "clipped"
+DEMOS_CLIPPED, DEMOS_MISSED = "demos_clipped", "demos_missed"
+"""Of demonstrations in replay: the share of the actions' numbers that are clipped, and of energy that they miss."""
 
 
 def tested(outcome: str) -> str:

@@ -70,7 +70,8 @@ class Reads:
 def sections(schema):
     """The dataclasses in the fields of a dataclass."""
     made = [entry.default_factory() for entry in fields(schema) if callable(entry.default_factory)]
-    return {type(value) for value in made if is_dataclass(value)}
+    kinds = {type(value) for value in made if is_dataclass(value)}
+    return kinds.union(*map(sections, kinds))
 
 
 def declarer(kind, name):

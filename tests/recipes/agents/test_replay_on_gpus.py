@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import STORED, minibatches, replay_buffer, storable
+from nht.recipes.agents.off_policy import STORED, DemosBuffer, minibatches, replay_buffer, storable
 from nht.recipes.run.draws import Draws
 from no_sync import Waits
 
@@ -29,16 +29,18 @@ def collected(*shape: int) -> TensorDict:
     return data
 
 
-def drawn(learners: int | None) -> Callable[[], list[TensorDict]]:
-    """Draws the minibatches after a batch of steps."""
-    buffer = replay_buffer(1000, CPU)
-    buffer.extend(storable(collected(*([] if learners is None else [learners]), 3, 20)))
+def drawn(learners: int | None, share: float) -> Callable[[], list[TensorDict]]:
+    """Draws the minibatches after a batch of steps; with a share of demonstrations, if it is not 0."""
+    buffer, beside = replay_buffer(1000, CPU), replay_buffer(1000, CPU)
+    for each in (buffer, beside):
+        each.extend(storable(collected(*([] if learners is None else [learners]), 3, 20)))
+    demos = DemosBuffer(beside, share) if share else None
     norm = RunningNorm(SIZE) if learners is None else TallNorm(learners)
     features = TensorDictModule(norm, ["observation"], ["features"])
     if learners is None:
-        return lambda: list(minibatches(buffer, UPDATES, 16, features, CPU))
+        return lambda: list(minibatches(buffer, UPDATES, 16, features, CPU, demos=demos))
     draws, sizes = Draws(range(learners), CPU), [16, 7][:learners]
-    return lambda: list(minibatches(buffer, UPDATES, sizes, features, CPU, draws))
+    return lambda: list(minibatches(buffer, UPDATES, sizes, features, CPU, draws, demos))
 
 
 class TallNorm(torch.nn.Module):
@@ -46,15 +48,16 @@ class TallNorm(torch.nn.Module):
 
     def __init__(self, learners: int) -> None:
         super().__init__()
-        self.register_buffer("scale", torch.rand(learners, 1, SIZE))
+        self.register_buffer("scale", torch.rand(learners, 1, 1, SIZE))  # beside (L, updates, B, SIZE)
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return observation * self.scale
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25])
 @pytest.mark.parametrize("learners", [None, 2])
-def test_drawing_minibatches_makes_nobody_wait(learners: int | None) -> None:
-    draw = drawn(learners)
+def test_drawing_minibatches_makes_nobody_wait(learners: int | None, share: float) -> None:
+    draw = drawn(learners, share)
     draw()  # what is made once is made
     with Waits() as waits:
         batches = draw()
