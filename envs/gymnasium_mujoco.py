@@ -82,11 +82,8 @@ def _gym_env(name: str, info_keys: Sequence[str], options: dict[str, Any]) -> En
             "pip install 'gymnasium[mujoco]'."
         ) from error
     except (TypeError, OverflowError) as error:
-        told = str(error)[:200].rstrip(".")
+        told = shorten(str(error), 300).rstrip(".")
         raise ValueError(f"{name} cannot be made with the options {options}: {told}.") from error
-        raise ValueError(
-            f"{name} cannot be made with the options {options}: {shorten(str(error), 300)}"
-        ) from error
     copy = gymnasium_copy(env)
     drawn_by_itself = type(copy) is GymnasiumCopy and "rgb_array" in copy.core.metadata.get(
         "render_modes", []

@@ -333,7 +333,8 @@ def _check_each(maps: Sequence[ActionMap], own: Sequence[dict[str, Any]]) -> Non
             check_numbers(**{name: value for name, value in numbers.items() if name != "seed"})
             check_storable(map)
         except (TypeError, ValueError) as error:
-            raise type(error)(f"map {place}: {error}") from error
+            told = str(error).rstrip(".")
+            raise type(error)(f"map {place}: {told}.") from error
 
 
 def _check_alike(maps: Sequence[ActionMap], shared: Sequence[str]) -> None:

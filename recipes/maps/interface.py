@@ -76,7 +76,7 @@ def trained_map(
     return _as_told(trained, finished, map)
 
 
-def train_maps(
+def trained_maps(
     maps: Sequence[MapConfig], env: EnvConfig, demos: DemosConfig, seeds: Sequence[int]
 ) -> list[nht.MapTraining | FloatingPointError]:
     """Train maps of one kind together, each as ``train_map`` would alone.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 
 import nht
-from nht.recipes.maps.interface import run_map, train_maps
+from nht.recipes.maps.interface import run_map, trained_maps
 from nht.recipes.maps.kinds import find_kind, map_context_keys
 from nht.recipes.sections import Training
 from nht.train_together import SHARING
@@ -38,7 +38,7 @@ class MapsOfRuns:
         """
         together = self._alike.pop(_likeness(run), [])
         if len(together) > 1:
-            found = train_maps(
+            found = trained_maps(
                 [each.map for each in together], run.env, run.demos, [each.seed for each in together]
             )
             self._trained |= {each.run.folder: map for each, map in zip(together, found, strict=True)}

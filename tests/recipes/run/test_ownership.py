@@ -85,7 +85,9 @@ def test_a_run_that_another_process_writes_is_left_alone(tmp_path):
         assert first.is_alive()
     first.join()
     assert first.exitcode == 0, killed_runs.words(folder)
-    refusal = f"FileExistsError: {folder} is being written by process {first.pid} on {os.uname().nodename}: wait, or"
+    refusal = (
+        f"OwnedError: {folder} is being written by process {first.pid} on {os.uname().nodename}: wait, or"
+    )
     assert killed_runs.words(folder).count(refusal) == 3
     killed_runs.finish("ddpg", tmp_path / "alone", told)
     tables = [pandas.read_csv(tmp_path / name / "metrics.csv") for name in ("run", "alone")]
