@@ -143,7 +143,15 @@ class Search:
     folder: str = path_field("")  # several machines may share it
     ray_address: str | None = None  # of a cluster, host:port or auto; None starts Ray on this machine
     num_workers: int | None = None  # runs at a time on this machine; None is one for each core
+    tasks_per_gpu: int = (
+        1  # runs, or packs, that share a GPU with device=cuda: while one simulates, another learns
+    )
     retry_failed: bool = False  # runs that failed or diverged before
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for fewer than one task on a GPU."""
+        if self.tasks_per_gpu < 1:
+            raise ValueError(f"tasks_per_gpu must be at least 1, got {self.tasks_per_gpu}.")
 
 
 @dataclass

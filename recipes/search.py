@@ -45,7 +45,7 @@ def main(config: Search) -> None:
     settings = asdict(search) | {"demos": asdict(config.demos)}
     del settings["learners"]  # decides nothing but the cost
     write_search_manifest(folder / "manifest.json", settings)
-    with closing(Cluster(config.ray_address, config.num_workers)) as cluster:
+    with closing(Cluster(config.ray_address, config.num_workers, config.tasks_per_gpu)) as cluster:
         if config.demos.path is None:
             record_demos(config, folder, demos)
         ended = known_rows(folder, config.retry_failed)

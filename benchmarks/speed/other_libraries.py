@@ -91,7 +91,7 @@ def with_cleanrl(setting: str, checkout: Path) -> float:
             )
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / name
-        file.write_text(f"import torch; torch.set_num_threads(1)\n{script}".replace("\n", "\n", 1))
+        file.write_text(f"import torch; torch.set_num_threads(1)\n{script}")
         costs = []
         for steps in (short, 3 * short):
             before = children()
@@ -110,6 +110,8 @@ def children() -> float:
 
 def main() -> None:
     """Print one measurement as JSON."""
+    if len(sys.argv) < 3:
+        return print(__doc__)
     library, setting, *more = sys.argv[1:]
     os.environ["OMP_NUM_THREADS"] = "1"
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"

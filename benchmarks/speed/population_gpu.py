@@ -176,7 +176,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--map", required=True)
+    parser.add_argument("--map")
     parser.add_argument("--learners", type=int, default=128)
     parser.add_argument("--processes", type=int, default=4)
     parser.add_argument("--threads", type=int, default=4)
@@ -187,6 +187,8 @@ def main() -> None:
     parser.add_argument("--pack", type=int)
     parser.add_argument("--folder")
     told = parser.parse_args()
+    if told.map is None:
+        return parser.print_help()
     if told.pack is not None:
         return train(told.pack, told)
     found = measure(told)

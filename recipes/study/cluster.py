@@ -35,13 +35,17 @@ class Cluster:
     Args:
         address: of a cluster, ``host:port`` or ``auto``; None starts Ray here.
         num_workers: number of jobs at a time if Ray is started here; None is one for each core.
+        tasks_per_gpu: how many share a GPU, if they train on one.
 
     Raises:
         ConnectionError: if nothing answers at ``address``.
         ImportError: if a machine of the cluster lacks this package, or has another version of it.
     """
 
-    def __init__(self, address: str | None = None, num_workers: int | None = None) -> None:
+    def __init__(
+        self, address: str | None = None, num_workers: int | None = None, tasks_per_gpu: int = 1
+    ) -> None:
+        self._tasks_per_gpu = tasks_per_gpu
         if address is None:
             ray.init(
                 num_cpus=num_workers,
@@ -61,16 +65,19 @@ class Cluster:
     def run(
         self, work: Callable[[Work, Path], object], tasks: Sequence[Work], folder: Path
     ) -> Iterator[Work]:
-        """Do ``work(task, folder)`` for all tasks, one core each, and yield each task once it is done.
+        """Do ``work(task, folder)`` for all tasks, and yield each task once it is done.
 
-        A task whose worker dies is tried again, three times; then its runs are recorded as failed. Tasks with
-        ``device=cuda`` get a GPU.
+        A task gets as many cores as its ``env.num_threads``, as far as a machine has them, and with ``device=cuda`` its
+        share of a GPU. If its worker dies, it is tried again, three times; then its runs are recorded as failed.
 
         Raises:
             RuntimeError: if Ray itself fails, or a run can be neither begun nor recorded, which is not the run's own
                 failure.
         """
-        remote = ray.remote(num_cpus=1, num_gpus=_gpus(tasks), max_retries=3)(work)
+        most = max(int(node["Resources"].get("CPU", 1)) for node in ray.nodes())
+        # All tasks of a stage have the same device and as many threads.
+        needed = resources(tasks[0].jobs[0].overrides, self._tasks_per_gpu, most) if tasks else {}
+        remote = ray.remote(**needed, max_retries=3)(work)
         waiting = {remote.remote(task, folder): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting), num_returns=1)
@@ -93,9 +100,21 @@ class Cluster:
         ray.shutdown()
 
 
-def _gpus(tasks: Sequence[Job] | Sequence[Pack]) -> int:
-    """Number of GPUs that each task needs: all tasks of a stage have the same device."""
-    return int(any(word.startswith("device=cuda") for task in tasks[:1] for word in task.jobs[0].overrides))
+def resources(overrides: Sequence[str], tasks_per_gpu: int, most_cpus: int) -> dict[str, float]:
+    """What Ray is to reserve for a task: ``num_cpus`` and ``num_gpus``.
+
+    Args:
+        overrides: of a run, as on a command line.
+        tasks_per_gpu: how many share a GPU.
+        most_cpus: that a machine has.
+    """
+    told = dict(word.split("=", 1) for word in overrides if "=" in word)
+    threads = told.get("env.num_threads", "1")
+    on_gpu = told.get("device", "cpu").startswith("cuda")
+    return {
+        "num_cpus": max(1, min(int(threads), most_cpus)) if threads.isdigit() else 1,
+        "num_gpus": 1 / tasks_per_gpu if on_gpu else 0,
+    }
 
 
 def _reason(error: RayError) -> str:

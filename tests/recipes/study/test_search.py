@@ -307,12 +307,16 @@ def fake_ray(error):
     def remote(**_):
         return lambda work: SimpleNamespace(remote=lambda job, folder: job.name)
 
-    return SimpleNamespace(remote=remote, wait=lambda waiting, num_returns: (waiting[:1], []), get=get)
+    nodes = [{"Resources": {"CPU": 1.0}}, {"Resources": {}}]
+    return SimpleNamespace(
+        remote=remote, wait=lambda waiting, num_returns: (waiting[:1], []), get=get, nodes=lambda: nodes
+    )
 
 
 def run_on(monkeypatch, error, folder):
     monkeypatch.setattr(cluster_module, "ray", fake_ray(error))
     cluster = object.__new__(cluster_module.Cluster)  # Ray is not started
+    cluster._tasks_per_gpu = 1
     return list(cluster.run(run_job, [job()], folder))
 
 
@@ -340,6 +344,21 @@ def test_a_job_whose_worker_always_dies_fails_unless_it_had_ended(monkeypatch, t
     Ending("done").write(tmp_path / job().name)
     run_on(monkeypatch, error, tmp_path)
     assert Ending.read(tmp_path / job().name) == Ending("done")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "needed"),
+    [
+        ([], {"num_cpus": 1, "num_gpus": 0}),
+        (["env.num_threads=3"], {"num_cpus": 3, "num_gpus": 0}),
+        (["env.num_threads=3", "env.num_threads=64"], {"num_cpus": 8, "num_gpus": 0}),
+        (["device=cuda", "env.num_threads=2"], {"num_cpus": 2, "num_gpus": 0.25}),
+        (["device=cuda:1"], {"num_cpus": 1, "num_gpus": 0.25}),
+        (["device=cuda", "device=cpu"], {"num_cpus": 1, "num_gpus": 0}),
+    ],
+)
+def test_what_a_task_needs(overrides, needed):
+    assert cluster_module.resources(overrides, tasks_per_gpu=4, most_cpus=8) == needed
 
 
 @pytest.mark.slow
