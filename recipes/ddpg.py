@@ -14,14 +14,8 @@ from tensordict.nn import TensorDictSequential
 from nht.recipes.agents.adam import LearnersAdam
 from nht.recipes.agents.cloning import cloning_of
 from nht.recipes.agents.ddpg import DDPG, PaperDDPGLoss, networks
-from nht.recipes.agents.off_policy import (
-    JointSoftUpdate,
-    descend,
-    exploring,
-    minibatches,
-    replay_buffer,
-    storable,
-)
+from nht.recipes.agents.off_policy import JointSoftUpdate, descend, exploring
+from nht.recipes.agents.replay import minibatches, replay_buffer, storable
 from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch

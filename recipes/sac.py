@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
-from nht.recipes.agents.off_policy import JointSoftUpdate, descend, minibatches, replay_buffer, storable
+from nht.recipes.agents.off_policy import JointSoftUpdate, descend
+from nht.recipes.agents.replay import minibatches, replay_buffer, storable
 from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.agents.sac import SAC, DirectSACLoss, networks

@@ -10,14 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from nht.recipes.agents.cloning import cloning_of
-from nht.recipes.agents.off_policy import (
-    JointSoftUpdate,
-    descend,
-    exploring,
-    minibatches,
-    replay_buffer,
-    storable,
-)
+from nht.recipes.agents.off_policy import JointSoftUpdate, descend, exploring
+from nht.recipes.agents.replay import minibatches, replay_buffer, storable
 from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.agents.td3 import TD3, DirectTD3Loss, networks

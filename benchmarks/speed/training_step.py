@@ -26,7 +26,8 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import nht
 from nht.recipes.agents.ddpg import PaperDDPGLoss, networks
-from nht.recipes.agents.off_policy import JointSoftUpdate, exploring, storable
+from nht.recipes.agents.off_policy import JointSoftUpdate, exploring
+from nht.recipes.agents.replay import storable
 from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.config import DDPG
 from nht.recipes.ddpg import main

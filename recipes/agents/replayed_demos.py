@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.data import TensorDictReplayBuffer
 
-from nht.recipes.agents.off_policy import DemosBuffer, replay_buffer
+from nht.recipes.agents.replay import DemosBuffer, replay_buffer
 from nht.recipes.run.demonstrations import asked_for, demonstrated
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.population import PopulationFolder

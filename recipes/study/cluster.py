@@ -76,8 +76,9 @@ class Cluster:
         """
         most = max(int(node["Resources"].get("CPU", 1)) for node in ray.nodes())
         # All tasks of a stage have the same device and as many threads.
-        needed = resources(tasks[0].jobs[0].overrides, self._tasks_per_gpu, most) if tasks else {}
-        remote = ray.remote(**needed, max_retries=3)(work)
+        told = tasks[0].jobs[0].overrides if tasks else []
+        cpus, gpus = resources(told, self._tasks_per_gpu, most)
+        remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=3)(work)
         waiting = {remote.remote(task, folder): task for task in tasks}
         while waiting:
             (ready,), _ = ray.wait(list(waiting), num_returns=1)
@@ -100,8 +101,8 @@ class Cluster:
         ray.shutdown()
 
 
-def resources(overrides: Sequence[str], tasks_per_gpu: int, most_cpus: int) -> dict[str, float]:
-    """What Ray is to reserve for a task: ``num_cpus`` and ``num_gpus``.
+def resources(overrides: Sequence[str], tasks_per_gpu: int, most_cpus: int) -> tuple[int, float]:
+    """How many cores and GPUs Ray is to reserve for a task.
 
     Args:
         overrides: of a run, as on a command line.
@@ -111,10 +112,8 @@ def resources(overrides: Sequence[str], tasks_per_gpu: int, most_cpus: int) -> d
     told = dict(word.split("=", 1) for word in overrides if "=" in word)
     threads = told.get("env.num_threads", "1")
     on_gpu = told.get("device", "cpu").startswith("cuda")
-    return {
-        "num_cpus": max(1, min(int(threads), most_cpus)) if threads.isdigit() else 1,
-        "num_gpus": 1 / tasks_per_gpu if on_gpu else 0,
-    }
+    cpus = max(1, min(int(threads), most_cpus)) if threads.isdigit() else 1
+    return cpus, 1 / tasks_per_gpu if on_gpu else 0.0
 
 
 def _reason(error: RayError) -> str:

@@ -11,14 +11,8 @@ import torch
 from tensordict.nn import TensorDictSequential
 
 from nht.recipes.agents.ddpg import DDPGConfig, PaperDDPGLoss, networks, policy
-from nht.recipes.agents.off_policy import (
-    JointSoftUpdate,
-    descend,
-    exploring,
-    minibatches,
-    replay_buffer,
-    storable,
-)
+from nht.recipes.agents.off_policy import JointSoftUpdate, descend, exploring
+from nht.recipes.agents.replay import minibatches, replay_buffer, storable
 from nht.recipes.agents.returns import n_step_returns
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.launch import launch

@@ -9,8 +9,9 @@ from nht.envs import make_env
 from nht.recipes.agents import ddpg, ppo
 from nht.recipes.agents.ddpg import DDPGConfig, PaperDDPGLoss
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import JointSoftUpdate, mean_over, minibatches, replay_buffer, storable
+from nht.recipes.agents.off_policy import JointSoftUpdate, mean_over
 from nht.recipes.agents.ppo import GaussianPPOLoss, PPOConfig, advantage_estimator
+from nht.recipes.agents.replay import minibatches, replay_buffer, storable
 from nht.recipes.agents.returns import charge_failure, n_step_returns, return_range
 from nht.recipes.agents.stacking import stacked
 from nht.recipes.run.draws import Draws

@@ -16,7 +16,7 @@ import tiny_runs
 from nht.recipes import collect_demos, evaluate
 from nht.recipes.agents.critics import CriticPair, critic_network
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import STORED, minibatches, replay_buffer, storable
+from nht.recipes.agents.replay import STORED, minibatches, replay_buffer, storable
 from nht.recipes.agents.td3 import DirectTD3Loss, TD3Config, networks
 from nht.recipes.config import CollectDemos, Evaluate
 from nht.recipes.launch import configure

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import STORED, DemosBuffer, minibatches, replay_buffer, storable
+from nht.recipes.agents.replay import STORED, DemosBuffer, minibatches, replay_buffer, storable
 from nht.recipes.run.draws import Draws
 from no_sync import Waits
 

@@ -15,7 +15,8 @@ from tensordict.nn import TensorDictModule
 
 from nht.recipes.agents import replayed_demos
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import DemosBuffer, OffPolicyConfig, minibatches, replay_buffer
+from nht.recipes.agents.off_policy import OffPolicyConfig
+from nht.recipes.agents.replay import DemosBuffer, minibatches, replay_buffer
 from nht.recipes.run.draws import Draws
 from nht.recipes.sections import ReplayDemosConfig
 

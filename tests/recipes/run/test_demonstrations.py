@@ -12,7 +12,7 @@ import torch
 import nht
 import populations
 import tiny_runs
-from nht.recipes.agents.off_policy import storable
+from nht.recipes.agents.replay import storable
 from nht.recipes.agents.returns import charge_failure, n_step_returns
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.data.recording import record_expert

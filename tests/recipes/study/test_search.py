@@ -349,12 +349,12 @@ def test_a_job_whose_worker_always_dies_fails_unless_it_had_ended(monkeypatch, t
 @pytest.mark.parametrize(
     ("overrides", "needed"),
     [
-        ([], {"num_cpus": 1, "num_gpus": 0}),
-        (["env.num_threads=3"], {"num_cpus": 3, "num_gpus": 0}),
-        (["env.num_threads=3", "env.num_threads=64"], {"num_cpus": 8, "num_gpus": 0}),
-        (["device=cuda", "env.num_threads=2"], {"num_cpus": 2, "num_gpus": 0.25}),
-        (["device=cuda:1"], {"num_cpus": 1, "num_gpus": 0.25}),
-        (["device=cuda", "device=cpu"], {"num_cpus": 1, "num_gpus": 0}),
+        ([], (1, 0)),
+        (["env.num_threads=3"], (3, 0)),
+        (["env.num_threads=3", "env.num_threads=64"], (8, 0)),
+        (["device=cuda", "env.num_threads=2"], (2, 0.25)),
+        (["device=cuda:1"], (1, 0.25)),
+        (["device=cuda", "device=cpu"], (1, 0)),
     ],
 )
 def test_what_a_task_needs(overrides, needed):
