@@ -16,11 +16,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
+import numpy as np
 import pandas
 
 from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
-from nht.recipes.study.curves import plot, read_runs, summarise
+from nht.recipes.study.curves import read_runs, summarise
+from nht.recipes.study.figures import colour as colour_of
 from nht.recipes.study.report import to_markdown
+from nht.recipes.study.scores import interval
 
 OUT = Path(__file__).parents[1] / "results" / "demos_in_replay"
 SEEDS, DEMOS = 5, 10_000
@@ -35,6 +39,7 @@ WAYS = {
     "a quarter": [f"algo.demos.transitions={DEMOS}", "algo.demos.share=0.25"],
 }
 """How demonstrations take part: not at all, in the replay buffer, as a quarter of each minibatch."""
+STYLES = {"none": ":", "prefilled": "--", "a quarter": "-"}
 
 
 def main() -> None:
@@ -80,8 +85,26 @@ def show(task: str, curves: pandas.DataFrame) -> None:
     training = curves.groupby("interface", sort=False)[trained(FAILURE)].mean()
     table["failed while training"] = [f"{training[name]:.2f}" for name in table["interface"]]
     (OUT / f"{task}.md").write_text(to_markdown(table))
-    plot(curves, SUCCESS, f"{task}, {DEMOS:,} demonstrated steps in replay", OUT / f"{task}.png")
+    plot(task, curves)
     print(table.to_string(index=False), flush=True)
+
+
+def plot(task: str, curves: pandas.DataFrame) -> None:
+    """Means over the seeds with their intervals: a colour for each interface, a line style for each way."""
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for name, group in curves.groupby("interface", sort=False):
+        interface, way = str(name).split(", ")
+        scores = group.groupby(FRAMES)[tested(SUCCESS)]
+        bands = np.array([interval(values.to_numpy()) for _, values in scores])
+        colour = colour_of(interface)
+        axes.plot(scores.mean(), color=colour, linestyle=STYLES[way], label=name)
+        axes.fill_between(scores.mean().index, *bands.T, color=colour, alpha=0.12, linewidth=0)
+    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03))
+    axes.set_title(f"{task}: {DEMOS:,} demonstrated steps, {SEEDS} seeds")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best", handlelength=3)
+    figure.savefig(OUT / f"{task}.png", dpi=150)
+    plt.close(figure)
 
 
 if __name__ == "__main__":
