@@ -212,9 +212,7 @@ class Training:
     seeds: int | None = None  # learners to train together, of seed, seed + 1 ..., each in a folder of its own
     device: str = "cpu"  # where networks and batches are: cpu, cuda or cuda:1
     torch_threads: int = 1  # of each process
-    tf32: bool = (
-        False  # on a GPU, float32 matrix products in TF32: 10 bits of each number count, sums are exact
-    )
+    tf32: bool = False  # on a GPU, whether float32 matrix products keep 10 bits of each factor, for speed
 
     def __post_init__(self) -> None:
         """Raise ValueError for settings that do not go together."""
