@@ -21,7 +21,7 @@ from nht.envs import make_env, make_expert
 from nht.reading import naming
 from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import CollectDemos
-from nht.recipes.data.answers import ANSWER, Controller, shared_driving
+from nht.recipes.data.answers import EXPERT_ACTION, Controller, shared_driving
 from nht.recipes.data.files import FILES, best_episodes, read_episodes
 from nht.recipes.data.recording import COPIES, endings, has_success, record_episodes, record_expert
 from nht.recipes.launch import launch
@@ -102,7 +102,7 @@ def record_policy(
             driver,
             demos,
             judged=has_success(env.name) and not relabel,
-            actuation_key=ANSWER if relabel else ("next", "actuation"),
+            actuation_key=EXPERT_ACTION if relabel else ("next", "actuation"),
         )
     settings = {
         "options": options,

@@ -1,4 +1,4 @@
-"""What lifts the ceiling of NHT on WAMGrasp: a further dimension, corrections, or demonstrations beside the expert's way.
+"""What lifts NHT's ceiling on WAMGrasp: another dimension, corrections, or demonstrations beside the expert's way.
 
 DDPG with 10,000 of the expert's steps in replay, 200,000 steps, five seeds, through NHTs that differ in k and in what
 they were trained on, 100,000 transitions each:

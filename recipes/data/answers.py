@@ -14,7 +14,7 @@ import nht
 from nht.envs.experts import Expert
 from nht.envs.task import BatchedTask
 
-ANSWER = "answer"
+EXPERT_ACTION = "expert_action"
 """The key of what the expert would do."""
 MEMORY = 10
 """Steps after which a disturbance has forgotten itself."""
@@ -24,11 +24,11 @@ Controller = Callable[[TensorDictBase], TensorDictBase]
 
 
 def answering(expert: Expert, task: BatchedTask) -> Controller:
-    """Writes what an expert would do, ``(N, n)``, under ``ANSWER``."""
+    """Writes what an expert would do, ``(N, n)``, under ``EXPERT_ACTION``."""
 
     def answer(current: TensorDictBase) -> TensorDictBase:
         observation = {key: current[key].numpy() for key in task.observation_sizes}
-        return current.set(ANSWER, torch.from_numpy(expert(observation)).float())
+        return current.set(EXPERT_ACTION, torch.from_numpy(expert(observation)).float())
 
     return answer
 
@@ -75,6 +75,6 @@ def shared_driving(
         context = torch.cat([action[:, :0], *(current[key] for key in keys)], dim=-1)
         driven = map.decode(action, context, low, high)
         own = torch.arange(len(action)).unsqueeze(-1) % 2 == 1
-        return current.set("action", torch.where(own, current[ANSWER], driven))
+        return current.set("action", torch.where(own, current[EXPERT_ACTION], driven))
 
     return act

@@ -14,7 +14,7 @@ import nht
 from nht.envs import make_env, make_expert
 from nht.envs.registry import TASKS, find_task
 from nht.envs.task import BatchedTask
-from nht.recipes.data.answers import ANSWER, Controller, Disturbance, answering
+from nht.recipes.data.answers import EXPERT_ACTION, Controller, Disturbance, answering
 from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig
 
@@ -46,7 +46,7 @@ def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Pat
 
     def act(current: TensorDictBase) -> TensorDictBase:
         current = answer(current)
-        wanted = current[ANSWER]
+        wanted = current[EXPERT_ACTION]
         return current.set("action", wanted if disturb is None else disturb(wanted))
 
     with closing(simulation):
@@ -56,7 +56,7 @@ def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Pat
             act,
             demos,
             judged=has_success(env.name),
-            actuation_key="action" if disturb is None else ANSWER,
+            actuation_key="action" if disturb is None else EXPERT_ACTION,
         )
     settings = settings | ({"disturbance": demos.disturbance} if demos.disturbance else {})
     manifest = {"options": options, "expert": settings, "left_out_episodes": left_out}
@@ -92,7 +92,7 @@ def record_episodes(
         act: chooses the actions.
         demos: how many transitions, and the return that a good episode must have.
         judged: whether a good episode must end in success.
-        actuation_key: key of the executed actuation in the data of a step. For ``ANSWER``, which was not executed, the
+        actuation_key: key of the executed actuation in the data of a step. For ``EXPERT_ACTION``, which was not executed, the
             rewards and next observations, which are not its, are left out.
 
     Returns:
@@ -137,7 +137,7 @@ def _transition(
         "next": {key: outcome[key] for key in keys},
         "good": good,
     }
-    if actuation_key == ANSWER:
+    if actuation_key == EXPERT_ACTION:
         del entries["reward"], entries["next"]
     return TensorDict(entries, batch_size=stepped.batch_size)
 

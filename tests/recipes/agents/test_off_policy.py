@@ -57,7 +57,9 @@ def test_critics_start_near_the_lowest_return():
 
 def test_a_critic_of_another_make():
     critic = MLP(3, 1, num_cells=[4], activation_class=nn.Tanh)
-    with pytest.raises(TypeError, match="a pair of critics needs an MLP of Linear, LayerNorm and ReLU layers, got MLP"):
+    with pytest.raises(
+        TypeError, match="a pair of critics needs an MLP of Linear, LayerNorm and ReLU layers, got MLP"
+    ):
         CriticPair(critic, None)
 
 
