@@ -92,8 +92,8 @@ def record_episodes(
         act: chooses the actions.
         demos: how many transitions, and the return that a good episode must have.
         judged: whether a good episode must end in success.
-        actuation_key: key of the executed actuation in the data of a step. For ``EXPERT_ACTION``, which was not executed, the
-            rewards and next observations, which are not its, are left out.
+        actuation_key: key of the executed actuation in the data of a step. With ``EXPERT_ACTION``, which was not
+            executed, the rewards and next observations, which are not its, are left out.
 
     Returns:
         the good episodes, one after the other, and how many others ended.
