@@ -19,11 +19,12 @@ import sys
 from pathlib import Path
 
 import pandas
-from five_seeds import made, plot, save, trained_runs
+
+from populations import ARMS, made, plot, save, trained_runs
 
 OUT = Path(__file__).parents[1] / "results" / "grasp_ceiling"
 TASK = ["env=wam_grasp", "demos.transitions=100_000"]
-LEARNER = ["env=wam_grasp", "algo=ddpg_grasp", "map.action_scale=1", "algo.total_frames=200_000"]
+LEARNER = [*ARMS, "env=wam_grasp", "algo=ddpg_grasp", "map.action_scale=1", "algo.total_frames=200_000"]
 COLOURS = {"clean": "#0072B2", "disturbed": "#D55E00", "relabelled": "#009E73"}
 CORRECTIONS = {"": [], ", corrected": ["map.residual=0.3"]}
 VARIANTS = [

@@ -1,4 +1,4 @@
-"""Trains variants of a run, five seeds each as one population, and shows them: rows, a table, a figure.
+"""Trains variants of a run, several seeds each as one population, and shows them: rows, a table, a figure.
 
 A population that is finished is not repeated, one that was interrupted goes on.
 """
@@ -21,8 +21,8 @@ from nht.recipes.study.curves import read_runs, summarise
 from nht.recipes.study.report import to_markdown
 from nht.recipes.study.scores import interval
 
-SEEDS = 5
-SHARED = ["algo.hidden=[128,128]", "algo.bfloat16=true", "evaluation.episodes=50", "evaluation.every=20_000"]
+ARMS = ["algo.hidden=[128,128]", "algo.bfloat16=true", "evaluation.episodes=50", "evaluation.every=20_000"]
+"""Settings of the studies on the arm's tasks."""
 QUIET = ["evaluation.video=false", "run.wandb=false", "run.checkpoint_every=20_000"]
 COLUMNS = ["task", "interface", "seed", FRAMES, tested(SUCCESS), tested(FAILURE), trained(FAILURE), "seconds"]
 
@@ -34,9 +34,9 @@ def made(file: Path, recipe: str, told: Sequence[str]) -> Path:
     return file
 
 
-def trained_runs(run: Path, told: Sequence[str]) -> pandas.DataFrame:
+def trained_runs(run: Path, told: Sequence[str], seeds: int = 5) -> pandas.DataFrame:
     """The evaluations of a population of DDPG, trained first if need be."""
-    _run("ddpg", [*told, *SHARED, *QUIET, f"seeds={SEEDS}", f"run.folder={run}", "run.resume=auto"])
+    _run("ddpg", [*told, *QUIET, f"seeds={seeds}", f"run.folder={run}", "run.resume=auto"])
     return read_runs([run])
 
 
