@@ -6,7 +6,7 @@ python -m nht.recipes.compare_maps demos.path=runs/demos-wam_wipe maps=[nht,lase
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import matplotlib
@@ -30,6 +30,8 @@ from nht.recipes.maps.kinds import (
     map_context_keys,
     tasks_with_arm,
 )
+from nht.recipes.run.artifacts import demos_files, map_files
+from nht.recipes.run.dashboard import Dashboard, shown_on_dashboard, wanted
 
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
@@ -57,6 +59,7 @@ def main(config: CompareMaps) -> None:
     fixed = {kind for kind in config.maps if find_kind(kind).fixed_width}
     if not config.maps or not config.action_dims:
         raise ValueError(f"nothing to compare: got maps={config.maps} and action_dims={config.action_dims}.")
+    wanted(config.run)  # whether W&B is installed, if it is
     torch.set_num_threads(config.torch_threads)
     demos = nht.load_demos(config.demos.path, env=config.env.name)
     chosen = [
@@ -73,15 +76,43 @@ def main(config: CompareMaps) -> None:
         trained = trained_map(settings, config.env, config.demos, config.seed)
         kind, k = settings.kind, trained.map.action_dim
         maps[kind, k] = trained.map
-        nht.save_map(trained.map, out / "maps" / f"{kind_in_file_name(kind)}-k{k}.safetensors")
+        nht.save_map(trained.map, _map_file(out, kind, k))
         rows.append({"map": kind, "k": k, **_measured(trained, demos)})
         table = pandas.DataFrame(rows)
         table.to_csv(out / "table.csv", index=False)
         (out / "table.md").write_text(_markdown(table))
     _plot(table, out / "error.png")
     _draw(config, maps, demos, out)
+    with shown_on_dashboard(out, {"recipe": "compare_maps", **asdict(config)}, config.run) as dashboard:
+        if dashboard is not None:
+            _show(dashboard, table, maps, out, Path(config.demos.path))
     print((out / "table.md").read_text())
     print(f"saved in {out}")
+
+
+def _show(
+    dashboard: Dashboard,
+    table: pandas.DataFrame,
+    maps: dict[tuple[str, int], nht.ActionMap],
+    out: Path,
+    demos: Path,
+) -> None:
+    """Show table and figures, and hand the maps on; of those with as many axes, the one that fits best is the best."""
+    dashboard.take(demos_files(demos))
+    dashboard.table("maps", table)
+    for figure in sorted(out.glob("*.png")):
+        dashboard.picture(f"figures/{figure.stem}", figure)
+    best = table.loc[table.groupby("k")["validation_error"].idxmin().dropna()]
+    best_maps = set(zip(best["map"], best["k"], strict=True))
+    for row in table.to_dict("records"):
+        kind, k = str(row["map"]), int(row["k"])
+        file = _map_file(out, kind, k)
+        facts = {str(name): value for name, value in row.items() if name not in ("map", "k")}
+        dashboard.add(map_files(file, maps[kind, k], facts, best=(kind, k) in best_maps))
+
+
+def _map_file(out: Path, kind: str, action_dim: int) -> Path:
+    return out / "maps" / f"{kind_in_file_name(kind)}-k{action_dim}.safetensors"
 
 
 def _measured(trained: nht.MapTraining, demos: nht.Demos) -> dict[str, float]:

@@ -16,8 +16,8 @@ from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_ra
 from nht.recipes.agents.sac import SAC, DirectSACLoss, networks
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.gradient_norms import GradientNorms
 from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.gradient_norms import GradientNorms
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record

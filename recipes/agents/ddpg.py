@@ -123,8 +123,9 @@ class PaperDDPGLoss(DDPGLoss):
         self.returns = return_range(reward_range, gamma)
         actor, critic = actor_network.module, value_network.module
         target_actor, target_critic = deepcopy(actor), deepcopy(critic)
-        self.target_actor_network_params["module"].to_module(target_actor)
-        self.target_value_network_params["module"].to_module(target_critic)
+        parts = dict(self.named_children())  # as attributes, they warn that nothing moves them yet
+        parts["target_actor_network_params"]["module"].to_module(target_actor)
+        parts["target_value_network_params"]["module"].to_module(target_critic)
         # Not submodules: whose parameters they share are.
         self.__dict__["_networks"] = actor, critic, target_actor, target_critic
 

@@ -221,7 +221,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         self._add = add
 
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
-        """The ``"loss"`` to descend on, a scalar, the ``reports``, and the critic's target, for a minibatch ``(B,)``."""
+        """The ``"loss"`` to descend on, a scalar, the ``reports``, and the critic's target, for a batch ``(B,)``."""
         features = batch["features"]
         log_prob, entropy = self.actor_network.module.log_prob(features, batch["sample"])
         log_ratio = log_prob - batch["sample_log_prob"]

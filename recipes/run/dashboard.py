@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,14 @@ import pandas
 
 from nht.reading import entry, read_json, shortened
 from nht.recipes.run.artifacts import FileSet, finite
-from nht.recipes.run.metrics import BEST, ENV_STEPS, FRAMES, chart_row, charted, tested
+from nht.recipes.run.metrics import BEST, ENV_STEPS, FRAMES, MAP_STEPS, chart_row, charted, tested
 from nht.recipes.run.provenance import provenance
 from nht.recipes.run.wandb_internals import use_offline
 from nht.recipes.run.wandb_login import chosen_mode, import_wandb, logged_in, wanted
 from nht.recipes.sections import ChartsConfig
 from nht.writing import replacing
 
-__all__ = ["Dashboard", "import_wandb", "logged_in", "open_dashboard", "wanted"]
+__all__ = ["Dashboard", "import_wandb", "logged_in", "open_dashboard", "shown_on_dashboard", "wanted"]
 
 NOTE_FILE = "wandb.json"
 """In a folder: the id of its run on W&B, and how far that has been charted."""
@@ -125,6 +126,8 @@ class Dashboard:
         """The axis of the charts, and which values of a run its row in the table of runs has."""
         self._run.define_metric(ENV_STEPS)
         self._run.define_metric("*", step_metric=ENV_STEPS)
+        self._run.define_metric(MAP_STEPS)
+        self._run.define_metric("map/*", step_metric=MAP_STEPS)
         for outcome, side in BEST.items():
             name = charted(tested(outcome))
             self._run.define_metric(name, step_metric=ENV_STEPS, summary=f"{side},last")
@@ -136,6 +139,12 @@ class Dashboard:
         if frames > self._note.frames and self._remembered:
             self._note.frames = frames
             self._note.write()
+
+    def log_map(self, metrics: Mapping[str, float]) -> None:
+        """Chart how the training of a map goes on, against its own steps."""
+        step = metrics["step"]
+        row = {f"map/{name}": value for name, value in metrics.items() if name != "step"}
+        self._run.log({**row, MAP_STEPS: step})
 
     def film(self, frames: int, video: Path, name: str = "eval/film") -> None:
         """Show a film of a number of environment steps."""
@@ -179,6 +188,27 @@ class Dashboard:
     def leave(self) -> None:
         """Close a run that stopped before its end: a process may go on to other runs."""
         self._run.finish(exit_code=1)
+
+
+@contextmanager
+def shown_on_dashboard(
+    folder: Path,
+    settings: Mapping[str, Any],
+    charts: ChartsConfig,
+    *,
+    name: str = "",
+    remembered: bool = True,
+) -> Iterator[Dashboard | None]:
+    """Within, a command shows something on a dashboard, if it is wanted; it is closed with how the command ended."""
+    dashboard = open_dashboard(folder, settings, charts, name=name, remembered=remembered)
+    try:
+        yield dashboard
+    except BaseException:
+        if dashboard is not None:
+            dashboard.leave()
+        raise
+    if dashboard is not None:
+        dashboard.finish()
 
 
 def open_dashboard(

@@ -14,7 +14,7 @@ class GradientNorms:
     """The root mean square of the gradient's length over about the last ``1 / (1 - beta2)`` updates, a thousand.
 
     Adam (Kingma & Ba 2015) keeps the moving average v of each squared entry g^2. Without its bias, v / (1 - beta2^t),
-    the sum over all entries is the moving average of ||g||^2. Gradients that are clipped count as they are descended on.
+    the sum over all entries is the moving average of ||g||^2. Clipped gradients count as clipped.
 
     Args:
         optimiser: an Adam.

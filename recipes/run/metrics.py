@@ -40,6 +40,8 @@ EVERY_RUN = (FRAMES, *TESTED, SECONDS)
 
 ENV_STEPS = "env_steps"
 """The axis of all charts in W&B: environment steps."""
+MAP_STEPS = "map_steps"
+"""The axis of charts of a map's training: gradient steps."""
 IN_TIME = (SECONDS, FRAMES_PER_SECOND, UPDATES_PER_SECOND)
 SECTIONS = {"eval": "eval_", "train": "train_"}
 """Sections of charts in W&B, and the beginnings of the columns that belong there."""

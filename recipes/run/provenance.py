@@ -44,7 +44,7 @@ def _command() -> str:
 
 @cache
 def _commit(folder: Path) -> str | None:
-    """The commit of the repository that a folder is in, with ``-dirty`` if files differ from it; None outside of one."""
+    """The commit of the repository that a folder is in, with ``-dirty`` if files differ; None outside of one."""
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"],

@@ -38,7 +38,11 @@ def compared(common: list[str], tmp_path_factory: pytest.TempPathFactory) -> Pat
     out = tmp_path_factory.mktemp("compared") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare_maps, "LATENCY_SECONDS", 0.01)
-        compare_maps.main(configure(CompareMaps, "compare_maps", [*common, f"out={out}", f"maps={KINDS}"]))
+        compare_maps.main(
+            configure(
+                CompareMaps, "compare_maps", ["run.wandb=false", *common, f"out={out}", f"maps={KINDS}"]
+            )
+        )
     return out
 
 
@@ -137,14 +141,18 @@ def test_the_figures_draw_what_the_maps_do(
 
 def test_nothing_is_overwritten_or_guessed(compared: Path, common: list[str]) -> None:
     with pytest.raises(FileExistsError, match="never overwritten"):
-        compare_maps.main(configure(CompareMaps, "compare_maps", [*common, f"out={compared}"]))
+        compare_maps.main(
+            configure(CompareMaps, "compare_maps", ["run.wandb=false", *common, f"out={compared}"])
+        )
     for override, message in (
         ("maps=[nht,pca]", r"unknown map kind 'pca': choose from \['cae', "),
         ("maps=[]", r"nothing to compare: got maps=\[\]"),
         ("demos.path=null", r"demos.path must name the demonstrations"),
     ):
         with pytest.raises(ValueError, match=message):
-            compare_maps.main(configure(CompareMaps, "compare_maps", [*common, "out=unused", override]))
+            compare_maps.main(
+                configure(CompareMaps, "compare_maps", ["run.wandb=false", *common, "out=unused", override])
+            )
 
 
 def test_figures_of_what_is_not_there(demos: Path, tmp_path: Path) -> None:

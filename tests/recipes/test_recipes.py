@@ -48,7 +48,7 @@ def demos(tmp_path_factory):
 def map_file(demos, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "nht.safetensors"
     overrides = [f"demos.path={demos}", f"out={path}", "map.max_steps=500", "map.hidden=[32]"]
-    train_map.main(configure(TrainMap, "train_map", overrides))
+    train_map.main(configure(TrainMap, "train_map", ["run.wandb=false", *overrides, "run.wandb=false"]))
     return path
 
 
@@ -131,7 +131,7 @@ def test_the_papers_settings_run(map_file, tmp_path):
 
 def test_any_map_can_have_corrections(demos, map_file, tmp_path):
     overrides = ["map=svd", "map.residual=0.1", f"demos.path={demos}", f"out={tmp_path / 'svd'}"]
-    train_map.main(configure(TrainMap, "train_map", overrides))
+    train_map.main(configure(TrainMap, "train_map", ["run.wandb=false", *overrides, "run.wandb=false"]))
     saved = map_from_file(MapConfig("svd", str(tmp_path / "svd"), residual=0.1))
     assert (saved.action_dim, saved.scale) == (9, 0.1)
     train(tmp_path / "run", map_file, "map.residual=0.2", "algo.total_frames=1000")  # around a map without
@@ -176,7 +176,13 @@ def test_report_compares_the_runs_below_a_folder(run, map_file, tmp_path):
     shutil.copytree(folder, tmp_path / "runs" / "first")
     train(tmp_path / "runs" / "second", map_file, "seed=1")
     out = tmp_path / "report"
-    report.main(configure(Report, "report", [f"runs=[{tmp_path / 'runs'}]", f"out={out}", "title=Two seeds"]))
+    report.main(
+        configure(
+            Report,
+            "report",
+            ["run.wandb=false", f"runs=[{tmp_path / 'runs'}]", f"out={out}", "title=Two seeds"],
+        )
+    )
     curves = pandas.read_csv(out / "curves.csv")
     assert sorted(curves["seed"].unique()) == [0, 1]
     assert curves[curves["seed"] == 0]["eval_success"].tolist() == metrics["eval_success"].tolist()
@@ -196,7 +202,9 @@ def test_report_stops_where_a_seed_does():
 def test_report_of_returns(run, tmp_path):
     folder, metrics = run
     out = tmp_path / "report"
-    report.main(configure(Report, "report", [f"runs=[{folder}]", f"out={out}", "metric=return"]))
+    report.main(
+        configure(Report, "report", ["run.wandb=false", f"runs=[{folder}]", f"out={out}", "metric=return"])
+    )
     last = f"{metrics['eval_return'].iloc[-1]:,.0f}"
     assert f"| nht | 1 | 2000 | {last} | {last} .. {last} | {last} |" in (out / "return-table.md").read_text()
     assert iio.imread(out / "return.png").ndim == 3
@@ -242,7 +250,9 @@ def test_demonstrations_and_maps_are_never_overwritten(demos, map_file):
     with pytest.raises(FileExistsError, match=r"never overwritten"):
         collect_demos.main(configure(CollectDemos, "collect_demos", [f"out={demos}"]))
     with pytest.raises(FileExistsError, match=r"never overwritten"):
-        train_map.main(configure(TrainMap, "train_map", [f"demos.path={demos}", f"out={map_file}"]))
+        train_map.main(
+            configure(TrainMap, "train_map", ["run.wandb=false", f"demos.path={demos}", f"out={map_file}"])
+        )
 
 
 def test_a_context_key_that_the_environment_lacks(map_file, tmp_path):
@@ -268,7 +278,11 @@ def test_demonstrations_of_another_env(demos, tmp_path):
     found = nht.load_demos(demos)
     nht.save_demos(found.data, tmp_path / "demos", env="cheetah", seed=0, expert="unknown")
     with pytest.raises(ValueError, match=r"of env 'cheetah', expected 'wam_wipe'"):
-        train_map.main(configure(TrainMap, "train_map", [f"demos.path={tmp_path / 'demos'}", "out=unused"]))
+        train_map.main(
+            configure(
+                TrainMap, "train_map", ["run.wandb=false", f"demos.path={tmp_path / 'demos'}", "out=unused"]
+            )
+        )
 
 
 def test_a_jacobian_without_an_arm():
@@ -325,4 +339,6 @@ def test_evaluating_what_is_no_run(tmp_path):
 
 def test_reporting_where_there_is_no_run(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no metrics.csv in or below"):
-        report.main(configure(Report, "report", [f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"]))
+        report.main(
+            configure(Report, "report", ["run.wandb=false", f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"])
+        )

@@ -24,7 +24,9 @@ def write(folder, rows):
 def test_the_same_rows_give_the_same_report(tmp_path, metric, capsys):
     folder = write(tmp_path / "search", toy_search.rows(metric=metric))
     for out in ("first", "again"):
-        report.main(configure(Report, "report", [f"folder={folder}", f"out={tmp_path / out}"]))
+        report.main(
+            configure(Report, "report", ["run.wandb=false", f"folder={folder}", f"out={tmp_path / out}"])
+        )
     assert "nht" in capsys.readouterr().out
     first, again = (sorted((tmp_path / out).iterdir()) for out in ("first", "again"))
     wanted = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} | {"report.md", "report.html"}
@@ -72,7 +74,7 @@ def test_correlations_by_interface():
 @pytest.mark.parametrize("shape", [(1, 3), (3, 1), (1, 1)])
 def test_one_configuration_or_one_seed_is_enough(tmp_path, shape):
     folder = write(tmp_path / "search", toy_search.rows(*shape, best_seeds=0))
-    report.main(configure(Report, "report", [f"folder={folder}"]))
+    report.main(configure(Report, "report", ["run.wandb=false", f"folder={folder}"]))
     text = (folder / "report" / "report.md").read_text()
     assert "the very seeds that it was chosen by" in text
 
