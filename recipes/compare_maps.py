@@ -9,16 +9,13 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
-
 import matplotlib.pyplot as plt
 import pandas
 import torch
 
 import nht
 from nht.recipes.config import CompareMaps
+from nht.recipes.figure_style import COLUMN, save, style
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
 from nht.recipes.maps.interface import trained_map
@@ -32,6 +29,7 @@ from nht.recipes.maps.kinds import (
 )
 from nht.recipes.run.artifacts import demos_files, map_files
 from nht.recipes.run.dashboard import Dashboard, shown_on_dashboard, wanted
+from nht.recipes.study.figures import colour
 
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
@@ -203,19 +201,16 @@ def _cell(value: str | float) -> str:
 
 def _plot(table: pandas.DataFrame, path: Path) -> None:
     """Plot the error against k. The legend names maps with error 0, which a logarithmic axis cannot show."""
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for kind, rows in table.groupby("map", sort=False):
-        error = rows["validation_error"].where(rows["validation_error"] > 0)
-        label = str(kind) if error.notna().any() else f"{kind} (k = {rows['k'].iloc[0]}): exact"
-        axes.plot(rows["k"], error, marker="o", label=label)
-    axes.set(
-        xlabel="action dimensions k", ylabel="held-out error: share of |u|² that is missed", yscale="log"
-    )
-    axes.set_xticks(sorted(table["k"].unique()))
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside right upper", frameon=False)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    with style():
+        figure, axes = plt.subplots(figsize=(1.4 * COLUMN, COLUMN * 0.8), layout="constrained")
+        for kind, rows in table.groupby("map", sort=False):
+            error = rows["validation_error"].where(rows["validation_error"] > 0)
+            label = str(kind) if error.notna().any() else f"{kind} (k = {rows['k'].iloc[0]}): exact"
+            axes.plot(rows["k"], error, marker="o", label=label, color=colour(str(kind)))
+        axes.set(xlabel="action dimensions k", ylabel="held-out error, share of |u|²", yscale="log")
+        axes.set_xticks(sorted(table["k"].unique()))
+        figure.legend(loc="outside right upper")
+        save(figure, path)
 
 
 if __name__ == "__main__":

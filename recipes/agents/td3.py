@@ -128,7 +128,7 @@ class DirectTD3Loss(TD3Loss):
         self.__dict__["_target_critics"] = CriticPair(critic, parts["target_qvalue_network_params"])
 
     def forward(self, batch: TensorDictBase, *, actor: bool = True) -> TensorDictBase:
-        """The ``"loss_actor"``, 0 unless ``actor``; ``"loss_qvalue"`` and its ``"target_value"`` of a batch ``(B,)``."""
+        """``"loss_actor"``, 0 unless ``actor``; ``"loss_qvalue"`` and its ``"target_value"``, of a batch ``(B,)``."""
         loss_actor = self.actor_loss(batch)[0] if actor else batch["action"].new_zeros(())
         loss_qvalue, more = self.value_loss(batch)
         return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue} | more)

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas
 
+from nht.recipes.figure_style import GOLDEN, PAGE, label_ends, save, style, thousands
 from nht.recipes.run.config_file import read_settings
 from nht.recipes.run.folder import METRICS_FILE
 from nht.recipes.run.metrics import FAILURE, FRAMES, SECONDS, SUCCESS, tested
@@ -21,6 +18,8 @@ from nht.recipes.run.saved_run import CONFIG_FILE, OLDEST_ALGORITHM
 from nht.recipes.study.figures import colour
 from nht.recipes.study.scores import interquartile_mean, interval
 
+MARKED = 40
+"""Evaluations up to which each has a dot."""
 LABELS = ("task", "algorithm", "interface", "seed")
 """Columns that identify the run of an evaluation."""
 
@@ -116,21 +115,26 @@ def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
 
 
 def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path, lines: str = "interface") -> None:
-    """Plot the mean over seeds of every interface or algorithm, with its interval, against environment steps."""
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for name, group in curves.groupby(lines, sort=False):
-        by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]
-        frames = np.array(list(by_frames.groups))
-        bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
-        seeds = group["seed"].nunique()
-        label = f"{name} ({seeds} seed{'s' if seeds > 1 else ''})"
-        (line,) = axes.plot(frames, by_frames.mean(), label=label, color=colour(str(name).partition(" (")[0]))
-        axes.fill_between(frames, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.2, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel=f"{metric} of test episodes", title=title)
-    if metric == SUCCESS:
-        axes.set(ylim=(-0.03, 1.03))
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k")
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    """Plot the mean over seeds of every interface or algorithm, with its interval, against environment steps.
+
+    The axis begins at 0, a dot is an evaluation, and each line has its name at its end. A PDF lies beside the PNG.
+    """
+    with style():
+        width = 0.75 * PAGE
+        figure, axes = plt.subplots(figsize=(width, width * GOLDEN / 1.2), layout="constrained")
+        for name, group in curves.groupby(lines, sort=False):
+            by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]
+            frames = np.array(list(by_frames.groups))
+            bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
+            seeds = group["seed"].nunique()
+            label = f"{name} ({seeds} seed{'s' if seeds > 1 else ''})"
+            marker = "o" if len(frames) <= MARKED else ""
+            shade = colour(str(name).partition(" (")[0])
+            axes.plot(frames, by_frames.mean(), marker=marker, markersize=2, label=label, color=shade)
+            axes.fill_between(frames, bands[:, 0], bands[:, 1], color=shade, alpha=0.2, linewidth=0)
+        axes.set(xlabel="environment steps", ylabel=f"{metric} of test episodes", title=title)
+        if metric == SUCCESS:
+            axes.set(ylim=(-0.03, 1.03))
+        thousands(axes)
+        label_ends(axes)
+        save(figure, path)
