@@ -15,7 +15,7 @@ import torch
 
 import nht
 from nht.recipes.config import CompareMaps
-from nht.recipes.figure_style import COLUMN, save, style
+from nht.recipes.figure_style import COLUMN, save_figure, style
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
 from nht.recipes.maps.interface import trained_map
@@ -210,7 +210,7 @@ def _plot(table: pandas.DataFrame, path: Path) -> None:
         axes.set(xlabel="action dimensions k", ylabel="held-out error, share of |u|²", yscale="log")
         axes.set_xticks(sorted(table["k"].unique()))
         figure.legend(loc="outside right upper")
-        save(figure, path)
+        save_figure(figure, path)
 
 
 if __name__ == "__main__":

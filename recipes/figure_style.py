@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 COLUMN, PAGE = 3.4, 7.0
 """Widths of a paper with two columns [inch]: of a column, and of both."""
-GOLDEN = 0.62
+PANEL_SHAPE = 0.62
 """Height of a panel, as a share of its width."""
 BLUE, ORANGE, GREEN, RED, SKY, PURPLE, YELLOW = (
     "#0072B2",
@@ -37,7 +37,7 @@ BLUE, ORANGE, GREEN, RED, SKY, PURPLE, YELLOW = (
 PALETTE = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, YELLOW, "#000000")
 DASHES = ("-", "--", ":")
 GREY = "0.55"
-STYLE: dict[str, Any] = {
+LOOK: dict[str, Any] = {
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.titlelocation": "left",
@@ -73,11 +73,11 @@ SAME: dict[str, dict[str, Any]] = {
 @contextmanager
 def style() -> Iterator[None]:
     """Within, figures have this look."""
-    with plt.rc_context(STYLE):
+    with plt.rc_context(LOOK):
         yield
 
 
-def save(figure: Canvas, path: str | Path, *more: str) -> None:
+def save_figure(figure: Canvas, path: str | Path, *more: str) -> None:
     """Write a figure as PNG, as PDF beside it, and with ``more`` suffixes such as ``".svg"``; then close it.
 
     The same figure gives the same files, byte for byte.

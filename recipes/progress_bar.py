@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 TERMINAL, LOG = 0.1, 60.0
 """Least time between two drawings of a bar [s]."""
-LINE = "{desc}: {percentage:3.0f} %, {n_fmt} of {total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
+LOG_LINE = "{desc}: {percentage:3.0f} %, {n_fmt} of {total_fmt} [{elapsed}<{remaining}, {rate_fmt}{postfix}]"
 """A line in a log file."""
 CONTROLS = re.compile(r"\x1b\[[0-9;]*[A-Za-z]|[\r\n]")
 """What moves a terminal's cursor."""
@@ -48,7 +48,7 @@ def progress_bar(total: int, desc: str, unit: str, **more: Any) -> tqdm[Any]:
     if sys.stderr.isatty():
         look: dict[str, Any] = {"mininterval": TERMINAL, "maxinterval": 10.0, "file": sys.stderr}
     else:
-        look = {"mininterval": LOG, "maxinterval": LOG, "file": Lines(sys.stderr), "bar_format": LINE}
+        look = {"mininterval": LOG, "maxinterval": LOG, "file": Lines(sys.stderr), "bar_format": LOG_LINE}
     return tqdm(total=total, desc=desc, unit=unit, **look, **more)
 
 

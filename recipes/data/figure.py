@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from nht.recipes.data.files import Episodes, episode_returns
 from nht.recipes.data.summary import energy, lengths_of
-from nht.recipes.figure_style import BLUE, GREY, PAGE, PALETTE, style
-from nht.recipes.figure_style import save as save_figure
+from nht.recipes.figure_style import BLUE, GREY, PAGE, PALETTE, save_figure, style
 
 BINS = 30
 TRACES = 3  # episodes whose actuation is drawn

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import jacfwd, vmap
 
 import nht
-from nht.recipes.figure_style import PAGE, looks, save, style
+from nht.recipes.figure_style import PAGE, looks, save_figure, style
 
 LONGEST = 100  # steps of a demonstration that can still be told apart
 GRID = 9  # arrows along the longer side of the area where the tool was
@@ -70,7 +70,7 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
     motors = [f"motor {motor + 1}" for motor in range(actuation.shape[-1])]
     columns = max(2, int(figure.get_figwidth() / 0.75))  # as many as there is room for
     figure.legend(panels[0, 0].lines[:-1], motors, loc="outside lower center", ncols=min(7, columns))
-    save(figure, path)
+    save_figure(figure, path)
 
 
 @style()
@@ -119,7 +119,7 @@ def tool_figure(
         extend="both",
     )
     bar.set_ticks([-0.1, 0, 0.1], labels=["10 % down", "level", "10 % up"])
-    save(figure, path)
+    save_figure(figure, path)
 
 
 @torch.no_grad()

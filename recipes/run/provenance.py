@@ -13,7 +13,7 @@ from typing import Any
 
 import nht
 
-PACKAGES = ("nht", "torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy")
+VERSIONED = ("nht", "torch", "torchrl", "tensordict", "mujoco", "gymnasium", "numpy")
 
 
 def provenance() -> dict[str, Any]:
@@ -27,7 +27,7 @@ def provenance() -> dict[str, Any]:
 
 def _versions() -> dict[str, str]:
     found = {}
-    for package in PACKAGES:
+    for package in VERSIONED:
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

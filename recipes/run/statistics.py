@@ -22,7 +22,7 @@ TARGET = "target_value"
 """What the critics learn to predict, ``(B,)``, among the values that an update reports."""
 
 Totals = dict[str, torch.Tensor | float]
-Row = dict[str, float]
+Means = dict[str, float]
 
 
 @dataclass
@@ -142,7 +142,7 @@ class TrainingStatistics:
 
     def take(
         self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
-    ) -> list[Row | FloatingPointError]:
+    ) -> list[Means | FloatingPointError]:
         """Return the means of every learner and reset; NaN where nothing was counted.
 
         Args:
@@ -157,7 +157,7 @@ class TrainingStatistics:
 
     def latest(
         self, add: Callable[[torch.Tensor], torch.Tensor] = lambda sums: sums
-    ) -> list[Row | FloatingPointError]:
+    ) -> list[Means | FloatingPointError]:
         """The means since this was last called, or since ``take``, which does not notice. As of ``take``."""
         totals, before = self._totals(), self._shown
         self._shown = totals
@@ -173,12 +173,12 @@ class TrainingStatistics:
 
     def _rows(
         self, totals: Totals, add: Callable[[torch.Tensor], torch.Tensor]
-    ) -> list[Row | FloatingPointError]:
+    ) -> list[Means | FloatingPointError]:
         own = [torch.as_tensor(value, dtype=torch.float64).cpu() for value in totals.values()]
         summed = add(torch.stack([value.expand(self._learners or 1) for value in own]))
         return [self._row(dict(zip(totals, values, strict=True))) for values in summed.T.tolist()]
 
-    def _row(self, totals: dict[str, float]) -> Row | FloatingPointError:
+    def _row(self, totals: dict[str, float]) -> Means | FloatingPointError:
         updates, episodes, steps, sampled = (
             totals.pop(name) for name in ("updates", "episodes", "steps", "sampled")
         )

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas
 
-from nht.recipes.figure_style import GOLDEN, PAGE, label_ends, save, style, thousands
+from nht.recipes.figure_style import PAGE, PANEL_SHAPE, label_ends, save_figure, style, thousands
 from nht.recipes.run.config_file import read_settings
 from nht.recipes.run.folder import METRICS_FILE
 from nht.recipes.run.metrics import FAILURE, FRAMES, SECONDS, SUCCESS, tested
@@ -121,7 +121,7 @@ def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path, lines: s
     """
     with style():
         width = 0.75 * PAGE
-        figure, axes = plt.subplots(figsize=(width, width * GOLDEN / 1.2), layout="constrained")
+        figure, axes = plt.subplots(figsize=(width, width * PANEL_SHAPE / 1.2), layout="constrained")
         for name, group in curves.groupby(lines, sort=False):
             by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]
             frames = np.array(list(by_frames.groups))
@@ -137,4 +137,4 @@ def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path, lines: s
             axes.set(ylim=(-0.03, 1.03))
         thousands(axes)
         label_ends(axes)
-        save(figure, path)
+        save_figure(figure, path)

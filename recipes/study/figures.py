@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from nht.recipes.figure_style import COLUMN, GOLDEN, PAGE, label_ends, save, style, thousands
+from nht.recipes.figure_style import COLUMN, PAGE, PANEL_SHAPE, label_ends, save_figure, style, thousands
 from nht.recipes.maps.kinds import KINDS
 from nht.recipes.run.metrics import FRAMES, SUCCESS, tested
 from nht.recipes.study.results import SearchResults
@@ -62,7 +62,7 @@ def _line(interface: str) -> dict[str, Any]:
 
 
 def _save(canvas: Canvas, out: Path, figure: Figure) -> Figure:
-    save(canvas, out / f"{figure.name}.png", ".svg")
+    save_figure(canvas, out / f"{figure.name}.png", ".svg")
     return figure
 
 
@@ -113,7 +113,7 @@ def _spread(axes: Axes, place: float, scores: Scores, colour: str, rng: np.rando
 
 
 def _curves(results: SearchResults, out: Path) -> Figure:
-    canvas, axes = plt.subplots(figsize=(0.8 * PAGE, 0.8 * PAGE * GOLDEN / 1.2), layout="constrained")
+    canvas, axes = plt.subplots(figsize=(0.8 * PAGE, 0.8 * PAGE * PANEL_SHAPE / 1.2), layout="constrained")
     fresh = []
     for name in results.interfaces:
         number, rows, is_fresh = results.best(name)
@@ -144,7 +144,7 @@ def _task(results: SearchResults) -> str:
 
 
 def _profile(results: SearchResults, out: Path) -> Figure:
-    canvas, axes = plt.subplots(figsize=(1.35 * COLUMN, COLUMN * GOLDEN * 1.2), layout="constrained")
+    canvas, axes = plt.subplots(figsize=(1.35 * COLUMN, COLUMN * PANEL_SHAPE * 1.2), layout="constrained")
     every = np.concatenate([results.scores(name).ravel() for name in results.interfaces])
     levels = np.linspace(min(every.min(), 0.0), every.max(), 101)
     rng = np.random.default_rng(0)
@@ -169,7 +169,7 @@ def _band(axes: Axes, places: Scores, again: Scores, name: str) -> None:
 
 
 def _budget(results: SearchResults, out: Path) -> Figure:
-    canvas, axes = plt.subplots(figsize=(1.35 * COLUMN, COLUMN * GOLDEN * 1.2), layout="constrained")
+    canvas, axes = plt.subplots(figsize=(1.35 * COLUMN, COLUMN * PANEL_SHAPE * 1.2), layout="constrained")
     rng = np.random.default_rng(0)
     for name in results.interfaces:
         scores = results.scores(name)

@@ -67,7 +67,8 @@ assert configure(DDPG, "ddpg", ["env=six_reach_wide"]).env.options == {"radius":
 collect_demos.main(configure(CollectDemos, "collect_demos", ["env=six_reach", "demos.transitions=600", "out=demos"]))
 demos = nht.load_demos("demos", env="six_reach")
 assert demos.manifest["expert"] == "ReachExpert" and bool(demos.data["success"][-1])
-train = ["env=six_reach", "run.wandb=false", "map=two_sided", "map.args={size: 0.5}", "demos.path=demos", "map.max_steps=250"]
+train = ["env=six_reach", "run.wandb=false", "map=two_sided", "map.args={size: 0.5}", "demos.path=demos"]
+train += ["map.max_steps=250"]
 train_map.main(configure(TrainMap, "train_map", [*train, "out=map.safetensors"]))
 try:
     train_map.main(configure(TrainMap, "train_map", [*train[:3], "demos.path=demos", "map.args={sise: 0.5}", "out=x"]))
@@ -85,7 +86,8 @@ held.train(configure(held.schema, "held_ddpg", [*tiny, "map=none", "run.folder=h
 for run in ("run", "held"):
     evaluate.main(configure(Evaluate, "evaluate", [f"run={run}", "episodes=3", "video=false"]))
 report.main(configure(Report, "report", ["run.wandb=false", "runs=[run,held]", "out=report"]))
-compare = ["run.wandb=false", "env=six_reach", "demos.path=demos", "maps=[two_sided,svd]", "action_dims=[2]", "map.max_steps=250"]
+compare = ["run.wandb=false", "env=six_reach", "demos.path=demos", "maps=[two_sided,svd]", "action_dims=[2]"]
+compare += ["map.max_steps=250"]
 compare_maps.main(configure(CompareMaps, "compare_maps", [*compare, "out=compared"]))
 env = gymnasium.make("nht.envs:nht/SixReach-v0")
 env.reset(seed=0)

@@ -118,7 +118,7 @@ def test_the_figures_draw_what_the_maps_do(
     compared: Path, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr(map_figures, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(map_figures, "save_figure", lambda figure, path: drawn.append(figure))
     data = nht.load_demos(demos)
     maps = {file.stem: nht.load_map(file) for file in sorted((compared / "maps").iterdir())}
     wanted = {name: maps[name] for name in ("svd-k2", "jacobian-k6")}
