@@ -168,6 +168,7 @@ class Report:
     title: str = ""  # of figures and page; "" is what they show
     metric: str = "success"  # or return: what the table and the curves show of every evaluation
     lines: str = "interface"  # or algorithm: what is compared in a table and a figure
+    video: bool = True  # film the best policy of each, side by side, where there are policies
     run: ChartsConfig = field(default_factory=ChartsConfig)
 
     def __post_init__(self) -> None:

@@ -64,7 +64,7 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
             panel.axhline(0, color="0.5", linewidth=0.6, zorder=1)
             panel.set_xlim(0, max(1, len(actuation) - 1))
         kind = "basis" if isinstance(map, nht.LinearActionMap) else "derivative"
-        column[0].set_title(f"{name}: {kind}")
+        column[0].set_title(f"{name}: {kind}", loc="center")
         column[-1].set_xlabel("step")
     panels[0, 0].set_ylim(-1.05 * reach, 1.05 * reach)
     motors = [f"motor {motor + 1}" for motor in range(actuation.shape[-1])]
@@ -107,7 +107,7 @@ def tool_figure(
         for moved, panel in zip(velocity.unbind(-1), column[: map.action_dim], strict=True):
             _quiver(panel, position, moved, longest)
         shown = "" if map.action_dim == axes else f" ({min(axes, map.action_dim)} of {map.action_dim} axes)"
-        column[0].set_title(name + shown, fontsize=8 if not shown or width > 1.1 else 6)
+        column[0].set_title(name + shown, loc="center", fontsize=8 if not shown or width > 1.1 else 6)
         column[-1].set_xlabel("x [m]")
     share = min(0.9, 2.6 / figure.get_figwidth())  # of the width
     bar = figure.colorbar(

@@ -64,17 +64,22 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
             outcome = evaluate(env, policy, on_step=watch)
     finally:
         film.close()
+    write_film(path, film.frames, film.frames_per_second)
+    imageio.imwrite(path.with_suffix(".png"), contact_sheet(film.frames, film.states))
+    return outcome
+
+
+def write_film(path: Path, frames: list[list[Picture]], frames_per_second: float) -> None:
+    """Write moments, each with a picture of every copy, as an MP4."""
     options: dict[str, Any] = {
-        "fps": film.frames_per_second,
+        "fps": frames_per_second,
         "macro_block_size": 8,
         "ffmpeg_params": ["-preset", PRESET],
     }
     with imageio.get_writer(path, **options) as writer:
         video: Any = writer  # its stub lacks append_data
-        for tiles in film.frames:
+        for tiles in frames:
             video.append_data(grid(tiles))
-    imageio.imwrite(path.with_suffix(".png"), contact_sheet(film.frames, film.states))
-    return outcome
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ LABELS = ("task", "algorithm", "interface", "seed")
 
 
 def read_runs(folders: list[Path]) -> pandas.DataFrame:
-    """The evaluations of all runs in or below ``folders``, a row each, with ``LABELS``.
+    """The evaluations of all runs in or below ``folders``, a row each, with ``LABELS`` and the ``run``.
 
+    That is its number among ``run_folders``.
     An interface's name includes its number of actions if there are runs with several. Nothing that a run's
     configuration names is imported.
 
@@ -34,10 +35,13 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
         FileNotFoundError: if there is no run with an evaluation.
         ValueError: if a run's files cannot be read.
     """
-    metrics = sorted({path for folder in folders for path in folder.rglob(METRICS_FILE)})
-    if not metrics:
+    runs = run_folders(folders)
+    if not runs:
         raise FileNotFoundError(f"no {METRICS_FILE} in or below {[str(folder) for folder in folders]}.")
-    curves = pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
+    curves = pandas.concat(
+        [_read_run(folder / METRICS_FILE).assign(run=number) for number, folder in enumerate(runs)],
+        ignore_index=True,
+    )
     if curves.empty or tested(SUCCESS) not in curves:
         raise FileNotFoundError(
             f"no run in or below {[str(folder) for folder in folders]} has an evaluation yet."
@@ -45,6 +49,11 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
     widths = curves.groupby(["task", "interface"])["action_dim"].transform("nunique")
     named = curves["interface"] + " (k = " + curves["action_dim"].astype(str) + ")"
     return curves.assign(interface=curves["interface"].where(widths == 1, named)).drop(columns="action_dim")
+
+
+def run_folders(folders: list[Path]) -> list[Path]:
+    """The folders of all runs in or below ``folders``."""
+    return sorted({path.parent for folder in folders for path in folder.rglob(METRICS_FILE)})
 
 
 def _read_run(metrics: Path) -> pandas.DataFrame:

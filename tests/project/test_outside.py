@@ -85,7 +85,7 @@ held = find_algorithm("held_ddpg")
 held.train(configure(held.schema, "held_ddpg", [*tiny, "map=none", "run.folder=held"]))
 for run in ("run", "held"):
     evaluate.main(configure(Evaluate, "evaluate", [f"run={run}", "episodes=3", "video=false"]))
-report.main(configure(Report, "report", ["run.wandb=false", "runs=[run,held]", "out=report"]))
+report.main(configure(Report, "report", ["run.wandb=false", "video=false", "runs=[run,held]", "out=report"]))
 compare = ["run.wandb=false", "env=six_reach", "demos.path=demos", "maps=[two_sided,svd]", "action_dims=[2]"]
 compare += ["map.max_steps=250"]
 compare_maps.main(configure(CompareMaps, "compare_maps", [*compare, "out=compared"]))
@@ -113,5 +113,5 @@ def test_the_command_line_and_a_search(python):
     base = "search.base=[" + ",".join([*TINY[2:3], *TINY[4:], "map.max_steps=250"]) + "]"
     more = ["search.interfaces=[two_sided,raw]", "search.total_frames=400", "search.best_frames=400"]
     python("-m", "nht.recipes.search", *search, base, *more, "demos.path=shared", "folder=searched")
-    python("-m", "nht.recipes.report", "searched", "run.wandb=false")
+    python("-m", "nht.recipes.report", "searched", "run.wandb=false", "video=false")
     assert "| two_sided |" in (python.work / "searched" / "report" / "report.md").read_text()

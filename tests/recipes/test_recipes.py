@@ -180,7 +180,13 @@ def test_report_compares_the_runs_below_a_folder(run, map_file, tmp_path):
         configure(
             Report,
             "report",
-            ["run.wandb=false", f"runs=[{tmp_path / 'runs'}]", f"out={out}", "title=Two seeds"],
+            [
+                "run.wandb=false",
+                "video=false",
+                f"runs=[{tmp_path / 'runs'}]",
+                f"out={out}",
+                "title=Two seeds",
+            ],
         )
     )
     curves = pandas.read_csv(out / "curves.csv")
@@ -203,7 +209,11 @@ def test_report_of_returns(run, tmp_path):
     folder, metrics = run
     out = tmp_path / "report"
     report.main(
-        configure(Report, "report", ["run.wandb=false", f"runs=[{folder}]", f"out={out}", "metric=return"])
+        configure(
+            Report,
+            "report",
+            ["run.wandb=false", "video=false", f"runs=[{folder}]", f"out={out}", "metric=return"],
+        )
     )
     last = f"{metrics['eval_return'].iloc[-1]:,.0f}"
     assert f"| nht | 1 | 2000 | {last} | {last} .. {last} | {last} |" in (out / "return-table.md").read_text()
@@ -340,5 +350,9 @@ def test_evaluating_what_is_no_run(tmp_path):
 def test_reporting_where_there_is_no_run(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no metrics.csv in or below"):
         report.main(
-            configure(Report, "report", ["run.wandb=false", f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"])
+            configure(
+                Report,
+                "report",
+                ["run.wandb=false", "video=false", f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"],
+            )
         )

@@ -29,7 +29,10 @@ def test_the_same_rows_give_the_same_report(tmp_path, metric, capsys):
         )
     assert "nht" in capsys.readouterr().out
     first, again = (sorted((tmp_path / out).iterdir()) for out in ("first", "again"))
-    wanted = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} | {"report.md", "report.html"}
+    wanted = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf", "svg")} | {
+        "report.md",
+        "report.html",
+    }
     assert {path.name for path in first} == wanted
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
     text = (tmp_path / "first" / "report.md").read_text()
