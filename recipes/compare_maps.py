@@ -79,7 +79,7 @@ def main(config: CompareMaps) -> None:
         table = pandas.DataFrame(rows)
         table.to_csv(out / "table.csv", index=False)
         (out / "table.md").write_text(_markdown(table))
-    _plot(table, out / "error.png")
+    plot_errors(table, out / "error.png")
     _draw(config, maps, demos, out)
     with shown_on_dashboard(out, {"recipe": "compare_maps", **asdict(config)}, config.run) as dashboard:
         if dashboard is not None:
@@ -199,7 +199,7 @@ def _cell(value: str | float) -> str:
     return f"{value:,.0f}" if 1000 <= value < float("inf") else f"{value:.3g}"
 
 
-def _plot(table: pandas.DataFrame, path: Path) -> None:
+def plot_errors(table: pandas.DataFrame, path: Path) -> None:
     """Plot the error against k. The legend names maps with error 0, which a logarithmic axis cannot show."""
     with style():
         figure, axes = plt.subplots(figsize=(1.4 * COLUMN, COLUMN * 0.8), layout="constrained")

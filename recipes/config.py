@@ -36,6 +36,7 @@ __all__ = [
     "Search",
     "TrainMap",
     "Training",
+    "Workspace",
 ]
 
 
@@ -176,6 +177,16 @@ class Report:
         check_outcome("metric", self.metric)
         if self.lines not in ("interface", "algorithm"):
             raise ValueError(f"lines must be interface or algorithm, got {self.lines!r}.")
+
+
+@dataclass
+class Workspace:
+    """``python -m nht.recipes.workspace``."""
+
+    entity: str = ""  # your name on W&B, or your team's
+    project: str = "nht"  # whose runs are shown
+    name: str = "nht: training"  # of the view
+    group_by: str | None = None  # Group or "Job Type": one line for the runs of each, with a band
 
 
 @dataclass

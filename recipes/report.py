@@ -111,7 +111,7 @@ def show(config: Report, out: Path, tables: dict[str, pandas.DataFrame], name: s
             if not figure.with_suffix(".mp4").exists():
                 dashboard.picture(f"figures/{figure.stem}", figure)
         for video in sorted(out.glob("*.mp4")):
-            dashboard.film(0, video, f"films/{video.stem}")
+            dashboard.video(f"films/{video.stem}", video)
 
 
 if __name__ == "__main__":

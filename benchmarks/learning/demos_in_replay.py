@@ -20,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas
 
+from nht.recipes.figure_style import PAGE, label_ends, save_figure, style, thousands
 from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
 from nht.recipes.study.curves import read_runs, summarise
 from nht.recipes.study.figures import colour as colour_of
@@ -89,22 +90,21 @@ def show(task: str, curves: pandas.DataFrame) -> None:
     print(table.to_string(index=False), flush=True)
 
 
+@style()
 def plot(task: str, curves: pandas.DataFrame) -> None:
     """Means over the seeds with their intervals: a colour for each interface, a line style for each way."""
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure, axes = plt.subplots(figsize=(0.75 * PAGE, 0.42 * PAGE), layout="constrained")
     for name, group in curves.groupby("interface", sort=False):
         interface, way = str(name).split(", ")
         scores = group.groupby(FRAMES)[tested(SUCCESS)]
         bands = np.array([interval(values.to_numpy()) for _, values in scores])
         colour = colour_of(interface)
-        axes.plot(scores.mean(), color=colour, linestyle=STYLES[way], label=name)
+        axes.plot(scores.mean(), color=colour, linestyle=STYLES[way], marker="o", markersize=2, label=name)
         axes.fill_between(scores.mean().index, *bands.T, color=colour, alpha=0.12, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03))
-    axes.set_title(f"{task}: {DEMOS:,} demonstrated steps, {SEEDS} seeds")
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best", handlelength=3)
-    figure.savefig(OUT / f"{task}.png", dpi=150)
-    plt.close(figure)
+    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03), title=task)
+    thousands(axes)
+    label_ends(axes)
+    save_figure(figure, OUT / f"{task}.png")
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from nht.writing import replacing
 
 __all__ = ["Dashboard", "import_wandb", "logged_in", "open_dashboard", "shown_on_dashboard", "wanted"]
 
+FILM = "eval/film"
 NOTE_FILE = "wandb.json"
 """In a folder: the id of its run on W&B, and how far that has been charted."""
 
@@ -146,10 +147,15 @@ class Dashboard:
         row = {f"map/{name}": value for name, value in metrics.items() if name != "step"}
         self._run.log({**row, MAP_STEPS: step})
 
-    def film(self, frames: int, video: Path, name: str = "eval/film") -> None:
-        """Show a film of a number of environment steps."""
+    def film(self, frames: int, video: Path) -> None:
+        """Show a film of the policy after a number of environment steps, beside the row of that test."""
         if frames >= self._known:
-            self._run.log({name: self._wandb.Video(str(video), format="mp4"), ENV_STEPS: frames}, step=frames)
+            shown = self._wandb.Video(str(video), format="mp4")
+            self._run.log({FILM: shown, ENV_STEPS: frames}, step=frames)
+
+    def video(self, name: str, file: Path) -> None:
+        """Show a film, of whatever."""
+        self._run.log({name: self._wandb.Video(str(file), format="mp4")})
 
     def picture(self, name: str, file: Path) -> None:
         """Show a picture."""

@@ -1,5 +1,6 @@
 """Maps side by side: what the table holds, what the figures show."""
 
+import json
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import nht
+import wandb_file
 from nht.recipes import collect_demos, compare_maps
 from nht.recipes.config import CollectDemos, CompareMaps
 from nht.recipes.launch import configure
@@ -134,6 +136,28 @@ def test_the_figures_draw_what_the_maps_do(
     along_x, along_y = (drawn[1].axes[panel].collections[1] for panel in (1, 3))
     assert (np.abs(along_x.V) < 0.1 * along_x.U).all()  # a Jacobian's first axis is x, its second y
     assert (np.abs(along_y.U) < 0.1 * along_y.V).all()
+
+
+def test_the_comparison_stands_on_the_dashboard(
+    common: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compare_maps, "LATENCY_SECONDS", 0.01)
+    out = tmp_path / "out"
+    compare_maps.main(
+        configure(CompareMaps, "compare_maps", [*common, f"out={out}", "maps=[svd,none]", "action_dims=[2]"])
+    )
+    found = wandb_file.read_run(out)
+    logged = {name for row in found.rows for name in row}
+    assert {"maps", "figures/error", "figures/basis", "figures/tool"} <= logged
+    table = json.loads(next((out / "wandb").rglob("*.table.json")).read_text())
+    assert [row[:2] for row in table["data"]] == [["svd", 2], ["none", 7]]
+    handed = {
+        name: set(files.aliases) for name, files in found.artifacts.items() if not files.use_after_commit
+    }
+    assert [aliases for name, aliases in handed.items() if name.startswith("map-k2-")] == [{"latest", "best"}]
+    assert [name.split("-")[0] for name, files in found.artifacts.items() if files.use_after_commit] == [
+        "demos"
+    ]
 
 
 # Bad input.

@@ -1,5 +1,6 @@
 """The recipes end to end, a few steps each: what they write, that seeds act, that resuming changes nothing."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 import nht
+import wandb_file
 from nht.lipschitz import LipschitzProjection
 from nht.recipes import collect_demos, ddpg, evaluate, report, train_map
 from nht.recipes.config import DDPG, CollectDemos, Evaluate, Report, TrainMap
@@ -33,6 +35,8 @@ TINY = [
     "run.checkpoint_every=1000",
     "run.wandb=false",
 ]
+
+PLAIN = ["run.wandb=false", "video=false"]
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +216,7 @@ def test_report_of_returns(run, tmp_path):
         configure(
             Report,
             "report",
-            ["run.wandb=false", "video=false", f"runs=[{folder}]", f"out={out}", "metric=return"],
+            [*PLAIN, f"runs=[{folder}]", f"out={out}", "metric=return"],
         )
     )
     last = f"{metrics['eval_return'].iloc[-1]:,.0f}"
@@ -353,6 +357,34 @@ def test_reporting_where_there_is_no_run(tmp_path):
             configure(
                 Report,
                 "report",
-                ["run.wandb=false", "video=false", f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"],
+                [*PLAIN, f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"],
             )
         )
+
+
+def test_the_training_of_a_map_stands_on_the_dashboard_with_what_it_was_made_from(demos, tmp_path):
+    out = tmp_path / "maps" / "small.safetensors"
+    told = [f"demos.path={demos}", f"out={out}", "map.max_steps=250", "map.hidden=[8]", "seed=2"]
+    train_map.main(configure(TrainMap, "train_map", told))
+    found = wandb_file.read_run(out.parent)
+    assert (found.run.display_name, found.run.job_type, found.exit_code) == ("small", "train_map", 0)
+    assert found.config["map"]["max_steps"] == 250
+    errors = [row["map/validation_error"] for row in found.rows if "map/validation_error" in row]
+    assert len(errors) > 1
+    assert found.metrics["map/*"].step_metric == "map_steps"
+    fingerprint = nht.load_demos(demos).fingerprint[:8]
+    demonstrations = found.artifacts[f"demos-wam_wipe-{fingerprint}"]
+    map = found.artifacts[f"map-k2-{fingerprint}"]
+    assert (demonstrations.type, demonstrations.use_after_commit) == ("demonstrations", True)
+    assert (map.type, map.use_after_commit) == ("action-map", False)
+    metadata = json.loads(map.metadata)
+    assert metadata["class"] == "NHT"
+    assert metadata["validation_error"] == found.summary["map/validation_error"]
+    assert [content.path for content in demonstrations.manifest.contents] == ["manifest.json"]
+
+
+def test_a_training_of_a_map_that_fails_is_closed_as_failed(demos, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_map, "trained_map", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train_map.main(configure(TrainMap, "train_map", [f"demos.path={demos}", f"out={tmp_path / 'map'}"]))
+    assert wandb_file.read_run(tmp_path).exit_code == 1
