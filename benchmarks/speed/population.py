@@ -205,7 +205,7 @@ def draw(rows: pandas.DataFrame) -> None:
             label = f"{setting}{', bfloat16' if half else ''}"
             left.plot(medians.index, medians["core_seconds"], "o-", label=label)
             right.plot(medians.index, medians["memory"], "o-", label=label)
-    left.set(ylabel="core-seconds per learner and 1,000,000 steps")
+    left.set(ylabel="core-seconds per learner and 1M steps")
     right.set(ylabel="memory of the process [MB]")
     left.legend()
     for axes in (left, right):
