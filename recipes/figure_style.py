@@ -25,19 +25,12 @@ COLUMN, PAGE = 3.4, 7.0
 """Widths of a paper with two columns [inch]: of a column, and of both."""
 PANEL_SHAPE = 0.62
 """Height of a panel, as a share of its width."""
-BLUE, ORANGE, GREEN, RED, SKY, PURPLE, YELLOW = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#56B4E9",
-    "#CC79A7",
-    "#C8B900",  # Okabe and Ito's is lighter: too light for a line on white
-)
-PALETTE = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, YELLOW, "#000000")
+BLUE, ORANGE, GREEN, RED, SKY, PURPLE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7")
+PALETTE = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, "#000000")
+"""Without their yellow, which is too light for a line on white."""
 DASHES = ("-", "--", ":")
 GREY = "0.55"
-LOOK: dict[str, Any] = {
+LOOK: Any = {
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.titlelocation": "left",
@@ -51,7 +44,7 @@ LOOK: dict[str, Any] = {
     "axes.linewidth": 0.6,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.prop_cycle": plt.cycler(color=PALETTE),
+    "axes.prop_cycle": f"cycler('color', {list(PALETTE)})",
     "grid.alpha": 0.3,
     "grid.linewidth": 0.5,
     "xtick.major.width": 0.6,

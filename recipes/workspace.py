@@ -6,6 +6,7 @@ python -m nht.recipes.workspace entity=my-team project=nht
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 from nht.recipes.config import Workspace
@@ -90,8 +91,8 @@ def build(config: Workspace) -> Any:
     if not config.entity:
         raise ValueError("entity must be your name or your team's on W&B: entity=my-team.")
     try:
-        import wandb_workspaces.reports.v2 as reports
-        import wandb_workspaces.workspaces as workspaces
+        reports: Any = import_module("wandb_workspaces.reports.v2")
+        workspaces: Any = import_module("wandb_workspaces.workspaces")
     except ImportError as error:
         raise ImportError(
             "laying out a view needs wandb-workspaces: pip install 'nht[workspace]'."

@@ -21,6 +21,7 @@ from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig, mea
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.settings import Setting, beside
 from nht.recipes.agents.table import Algorithm
+from nht.recipes.run.metrics import VALUE
 from nht.recipes.sections import Training
 
 
@@ -130,7 +131,7 @@ class PaperDDPGLoss(DDPGLoss):
         self.__dict__["_networks"] = actor, critic, target_actor, target_critic
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critic's loss, a scalar, and the ``"target_value"`` ``(B,)`` of a batch ``(B,)``."""
+        """The critic's loss, a scalar; the ``"target_value"`` ``(B,)`` of a batch ``(B,)``, and the mean of that."""
         _, critic, target_actor, target_critic = self._networks
         outcome = tensordict["next"]
         with torch.no_grad():
@@ -139,7 +140,8 @@ class PaperDDPGLoss(DDPGLoss):
             target = outcome["reward"] + discount * ~outcome["terminated"] * later
             target.clamp_(*(beside(bound, target) for bound in self.returns))
         error = critic(tensordict["features"], tensordict["action"]) - target
-        return mean_over(tensordict, error.square()), {"target_value": target.squeeze(-1)}
+        told = {"target_value": target.squeeze(-1), VALUE: mean_over(tensordict, target)}
+        return mean_over(tensordict, error.square()), told
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, a scalar; its gradient leaves the critic alone."""

@@ -83,7 +83,7 @@ def best_values(rows: pandas.DataFrame) -> dict[str, float]:
     for outcome, side in BEST.items():
         values = rows[tested(outcome)]
         if values.notna().any():
-            place = values.idxmax() if side == "max" else values.idxmin()
+            place: Any = values.idxmax() if side == "max" else values.idxmin()
             found |= {f"best/{outcome}": float(values[place])}
             found |= {f"best/{outcome}_at": int(rows[FRAMES][place])}
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,8 +42,11 @@ class Filming:
         last = frames >= self._folder.config.algo.total_frames  # the film at the end shows it
         if self._every is None or frames % self._every or last or not self._ranks.first:
             return
+        begun = time.perf_counter()
         for learner, member in self._folder.finished():  # all that have not been given up
             self._film(learner, member, policy, member.path / FILMS / f"{frames:012d}.mp4", frames)
+        for member in self._folder.members:
+            member.leave_out(time.perf_counter() - begun)
 
     def at_the_end(self, learner: int, member: RunFolder, policy: TensorDictModuleBase, frames: int) -> None:
         """Film the final policy of a learner, if its configuration says so."""

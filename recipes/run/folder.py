@@ -226,6 +226,10 @@ class RunFolder:
         if self._charts is not None and rows[0]:
             self._charts.row(frames, rows[0] | {SECONDS: time.perf_counter() - self._started})
 
+    def leave_out(self, seconds: float) -> None:
+        """Count a time as none of the run's: it went into films."""
+        self._started += seconds
+
     def film(self, frames: int, video: Path) -> None:
         """Show a film of the policy on W&B."""
         if self._charts is not None:

@@ -170,7 +170,7 @@ class PopulationFolder:
             FloatingPointError: if all have diverged.
         """
         going_on = 0
-        charted = latest or [None] * len(rows)
+        charted: Sequence[Row | None] = latest or [None] * len(rows)
         for member, row, chart in zip(self.members, rows, charted, strict=True):
             if diverged(member.path) is not None or member.whole:
                 going_on += member.whole

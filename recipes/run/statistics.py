@@ -41,6 +41,13 @@ class Counters:
         self.frames, self.updates = saved["frames"], saved["updates"]
 
 
+def _value(losses: TensorDictBase) -> torch.Tensor | None:
+    """The mean of what the critics learn to predict: a loss gives it where minibatches of learners differ in size."""
+    value: torch.Tensor | None = losses.get(VALUE, None)
+    target: torch.Tensor | None = losses.get(TARGET, None) if value is None else None
+    return value if target is None else target.mean(-1)
+
+
 class TrainingStatistics:
     """Means since the last evaluation: losses, outcomes of ended episodes, and shares of clipped and diverged steps.
 
@@ -77,8 +84,8 @@ class TrainingStatistics:
         self._updates += 1
         for name in self._losses:
             self._sums[name] = self._sums[name] + losses[name].detach().double()
-        if self._updates % SAMPLED == 0 and (target := losses.get(TARGET, None)) is not None:
-            self._sums[VALUE] = self._sums[VALUE] + target.detach().mean(-1).double()
+        if self._updates % SAMPLED == 0 and (value := _value(losses)) is not None:
+            self._sums[VALUE] = self._sums[VALUE] + value.detach().double()
 
     def add_steps(self, steps: TensorDictBase) -> None:
         """Count the episodes that end among ``(T,)`` collected steps, copies that diverged and clipped actuations.
