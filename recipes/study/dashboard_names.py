@@ -7,15 +7,12 @@ import uuid
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from nht.reading import read_text
 from nht.recipes.overrides import quoted
 from nht.recipes.run.artifacts import valid_name
 from nht.writing import scratch
-
-if TYPE_CHECKING:
-    from nht.recipes.study.jobs import Job
 
 ID_FILE = "search-id.txt"
 """In the folder of a search: what tells it from others of the same name. All machines that share the folder read it."""
@@ -32,7 +29,27 @@ def search_name(folder: Path) -> str:
     return valid_name(f"{folder.resolve().name}-{read_text(file).strip()[:8]}")
 
 
-def names_of(job: Job, folder: Path) -> Sequence[str]:
+class RunOfSearch(Protocol):
+    """What tells the runs of a search apart."""
+
+    @property
+    def stage(self) -> str:
+        """``search`` or ``best``."""
+
+    @property
+    def interface(self) -> str:
+        """The interface of the run."""
+
+    @property
+    def configuration(self) -> int:
+        """Its number."""
+
+    @property
+    def seed(self) -> int:
+        """Of map and agent."""
+
+
+def names_of(job: RunOfSearch, folder: Path) -> Sequence[str]:
     """Overrides for a run's recipe: a group for each configuration, and a name that says which run it is."""
     search = search_name(folder)
     said = {

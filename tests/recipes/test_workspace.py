@@ -44,6 +44,7 @@ def test_somebody_must_be_named():
 
 
 def test_without_its_package_it_says_which(monkeypatch):
-    monkeypatch.setitem(sys.modules, "wandb_workspaces", None)
+    for module in ("wandb_workspaces", "wandb_workspaces.reports.v2", "wandb_workspaces.workspaces"):
+        monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=r"pip install 'nht\[workspace\]'"):
         workspace.build(Workspace(entity="somebody"))
