@@ -71,7 +71,7 @@ def _draw_energy(axes: Axes, shares: NDArray[np.float64]) -> None:
     axes.bar(ks, shares, color=BLUE, alpha=0.8)
     axes.axhline(1.0, color=GREY, linestyle="--")
     for k, share in zip(ks, shares, strict=True):
-        text = f"{100 * share:.1f}" if share < 0.9995 else f"{100 * share:.2f}"
+        text = f"{100 * share:.1f}" if share < 0.9995 else f"{100 * share:.2f}" if share < 0.99995 else "100"
         axes.annotate(
             text, (k, share), (0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=6.5
         )

@@ -31,8 +31,8 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
     """Plot the bases of maps along a demonstration: a column of panels per map, a row per basis vector.
 
     A panel has a line for each motor; of a long demonstration it shows the first steps. For a map that is not linear,
-    ``local_basis`` takes the place of the basis, times ``action_scale``: the actuation that an action of 1 adds. All
-    panels have one scale.
+    ``local_basis`` takes the place of the basis. Both are shown times ``action_scale``, as the actuation that an action
+    of 1 adds, and all panels have one scale.
 
     Args:
         maps: trained maps, by the name to show.
@@ -54,9 +54,7 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
     )
     reach = 1.0
     for (name, map), column in zip(maps.items(), panels.T, strict=True):
-        basis = local_basis(map, demos.context(_keys(map))[rows], actuation)
-        if not isinstance(map, nht.LinearActionMap):
-            basis = basis * float(map.action_scale)
+        basis = float(map.action_scale) * local_basis(map, demos.context(_keys(map))[rows], actuation)
         reach = max(reach, float(basis.abs().max()))
         for entries, panel in zip(basis.unbind(-1), column[: map.action_dim], strict=True):
             for line, look in zip(entries.unbind(-1), looks(entries.shape[-1]), strict=True):

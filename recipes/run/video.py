@@ -89,10 +89,17 @@ class State:
     Attributes:
         seconds: since its episode began.
         outcome: ``success``, ``failed``, or nothing yet.
+        name: of the copy, if it has one.
     """
 
     seconds: float
     outcome: str = ""
+    name: str = ""
+
+    def told(self, digits: int = 1, *more: str) -> str:
+        """All that in a line, with ``more`` behind the time."""
+        parts = (self.name, f"{self.seconds:.{digits}f} s", *more, self.outcome)
+        return "  ".join(part for part in parts if part)
 
 
 class Film:
@@ -144,7 +151,7 @@ class Film:
         if not self._running[row]:
             return self.states[-1][row]
         outcome = "failed" if failure else "success" if success else ""
-        return State(self._steps * self._seconds_per_step, outcome)
+        return State(self._steps * self._seconds_per_step, outcome, self._name)
 
     def _tile(self, row: int, state: State) -> Picture:
         if not self._running[row]:
@@ -152,10 +159,9 @@ class Film:
         trail = np.stack([points[row] for points in self._trail[::TRAIL_EVERY]]) if self._trail else None
         picture = Image.fromarray(self._renderer.frame(row, trail))
         frame(picture, state.outcome)
-        parts = [self._name, f"{state.seconds:4.2f} s", f"{self.speed} x" * (self.speed > 1), state.outcome]
         ImageDraw.Draw(picture).text(
             MARGIN,
-            "  ".join(part for part in parts if part),
+            state.told(2, f"{self.speed} x" * (self.speed > 1)),
             fill=(255, 255, 255),
             stroke_width=2,
             stroke_fill=(0, 0, 0),
@@ -212,8 +218,6 @@ def _stated(tile: Picture, state: State) -> Picture:
     draw = ImageDraw.Draw(picture)
     bar = (0, 0, picture.width - 1, STATE_HEIGHT)
     draw.rectangle(bar, fill=COLOURS[state.outcome] if state.outcome else (60, 60, 60))
-    draw.text(
-        (BORDER + 4, 2), f"{state.seconds:.1f} s  {state.outcome}", fill=(255, 255, 255), font_size=STATE_FONT
-    )
+    draw.text((BORDER + 4, 2), state.told(), fill=(255, 255, 255), font_size=STATE_FONT)
     frame(picture, state.outcome)
     return np.asarray(picture)

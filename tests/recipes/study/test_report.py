@@ -5,9 +5,11 @@ import pandas
 import pytest
 
 import toy_search
+import wandb_file
 from nht.recipes import report
 from nht.recipes.config import Report
 from nht.recipes.launch import configure
+from nht.recipes.study.dashboard_names import search_name
 from nht.recipes.study.report import failures, search_summary
 from nht.recipes.study.results import SearchResults, final_scores, read_results
 
@@ -41,6 +43,15 @@ def test_the_same_rows_give_the_same_report(tmp_path, metric, capsys):
     assert all(f"]({name}.png)" in text for name in FIGURES)
     page = (tmp_path / "first" / "report.html").read_text()
     assert page.count("data:image/svg+xml;base64,") == len(FIGURES)
+
+
+def test_a_search_is_one_summary_run_that_has_its_tables_and_figures(tmp_path):
+    folder = write(tmp_path / "search", toy_search.rows(4, 2))
+    report.main(configure(Report, "report", [f"folder={folder}"]))
+    found = wandb_file.read_run(folder / "report")
+    assert found.run.display_name == search_name(folder)
+    logged = {name for row in found.rows for name in row}
+    assert {"tables/interfaces", *(f"figures/{name}" for name in FIGURES)} <= logged
 
 
 def test_the_table_tells_the_interfaces_apart():
