@@ -19,6 +19,8 @@ from nht.manifest import DEMOS_MANIFEST, read_manifest
 LONGEST_NAME = 128
 """Largest number of characters in the name of an artifact."""
 LATEST, BEST_ALIAS = "latest", "best"
+ERROR = "validation_error"
+"""The fact that tells which of the maps with one name fits best."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,12 @@ def policy_files(file: Path, run: str, facts: Mapping[str, float], *, best: bool
     """
     aliases = (LATEST, BEST_ALIAS) if best else (LATEST,)
     return FileSet(valid_name(f"policy-{run}"), "policy", {file.name: file}, finite(facts), aliases)
+
+
+def fits_best(facts: Mapping[str, Any], known: Mapping[str, Any] | None) -> bool:
+    """Whether a map's error is no larger than that of the best one so far; None is that there is none."""
+    error = facts.get(ERROR)
+    return isinstance(error, float) and (known is None or error <= float(known.get(ERROR, math.inf)))
 
 
 def valid_name(name: str) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import pandas
 
 from nht.reading import entry, read_json, shortened
-from nht.recipes.run.artifacts import FileSet, finite
+from nht.recipes.run.artifacts import BEST_ALIAS, ERROR, FileSet, finite, fits_best
 from nht.recipes.run.metrics import BEST, ENV_STEPS, FRAMES, MAP_STEPS, chart_row, charted, tested
 from nht.recipes.run.provenance import provenance
 from nht.recipes.run.wandb_internals import use_offline
@@ -171,8 +171,21 @@ class Dashboard:
         self._run.summary.update(finite(facts))
 
     def add(self, files: FileSet) -> None:
-        """Hand a version of files to other runs."""
-        self._run.log_artifact(self._artifact(files), aliases=list(files.aliases))
+        """Hand a version of files to other runs. Online, the server says whether a map is the best of its name."""
+        aliases = set(files.aliases)
+        if not self._run.offline and ERROR in files.facts:
+            aliases -= {BEST_ALIAS}
+            aliases |= {BEST_ALIAS} if fits_best(files.facts, self._best_so_far(files)) else set()
+        self._run.log_artifact(self._artifact(files), aliases=sorted(aliases))
+
+    def _best_so_far(self, files: FileSet) -> Mapping[str, Any] | None:
+        """The facts about the best version on the server; None if there is none."""
+        name = f"{self._run.entity}/{self._run.project}/{files.name}:{BEST_ALIAS}"
+        try:
+            facts: Mapping[str, Any] = self._wandb.Api().artifact(name, type=files.type).metadata
+        except (self._wandb.Error, ValueError):  # it does not say which of several reasons
+            return None
+        return facts
 
     def take(self, files: FileSet) -> None:
         """Note that the run is made from files that another run may have handed on."""

@@ -12,12 +12,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from nht.recipes.figure_style import COLUMN, PAGE, PANEL_SHAPE, label_ends, save_figure, style, thousands
+from nht.recipes.figure_style import (
+    BLUE,
+    COLUMN,
+    GREEN,
+    ORANGE,
+    PAGE,
+    PANEL_SHAPE,
+    RED,
+    label_ends,
+    save_figure,
+    style,
+    thousands,
+)
 from nht.recipes.maps.kinds import KINDS
 from nht.recipes.run.metrics import FRAMES, SUCCESS, tested
 from nht.recipes.study.results import SearchResults
 from nht.recipes.study.scores import Scores, best_of, interval, percentiles, performance_profile, resampled
 
+ALGORITHM_COLOURS = {"ddpg": BLUE, "td3": ORANGE, "sac": GREEN, "ppo": RED}
+"""Colours of algorithms, where these are compared."""
 OTHER_COLOURS = ("#A6761D", "#7570B3", "#E7298A")
 """Colours of interfaces whose kind of map has none of its own."""
 BAND_RESAMPLES = 500
@@ -50,10 +64,17 @@ def draw_all(results: SearchResults, out: Path) -> list[Figure]:
 
 
 def colour(interface: str) -> str:
-    """The colour of an interface in all figures: that of its kind of map, or else one derived from its name."""
+    """The colour of an interface in all figures: that of its kind of map, or else one derived from its name.
+
+    Algorithms have theirs, too.
+    """
     kind = "none" if interface == "raw" else interface
     known = KINDS[kind].colour if kind in list(KINDS) else None
-    return known or OTHER_COLOURS[sum(interface.encode()) % len(OTHER_COLOURS)]
+    return (
+        known
+        or ALGORITHM_COLOURS.get(interface)
+        or OTHER_COLOURS[sum(interface.encode()) % len(OTHER_COLOURS)]
+    )
 
 
 def _line(interface: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pandas
@@ -15,7 +16,7 @@ import wandb_file
 from nht.recipes.config import DDPG, RunConfig
 from nht.recipes.launch import configure
 from nht.recipes.run.artifacts import FileSet, valid_name
-from nht.recipes.run.dashboard import logged_in, open_dashboard, wanted
+from nht.recipes.run.dashboard import Dashboard, logged_in, open_dashboard, wanted
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
@@ -269,3 +270,49 @@ def test_without_wandb_a_run_that_wants_it_says_so_before_anything_is_written(tm
         RunFolder(configure(DDPG, "ddpg", told), Ranks())
     assert not folder.exists()
     RunFolder(configure(DDPG, "ddpg", [*told, "run.wandb=false"]), Ranks()).close()
+
+
+class Online:
+    """What a dashboard asks of a run that is online, and of the server, which knows the best version."""
+
+    offline, entity, project = False, "somebody", "nht"
+
+    def __init__(self, best):
+        self.best, self.asked, self.logged = best, [], []
+
+    Error = type("Error", (Exception,), {})
+
+    def Api(self):  # noqa: N802 - W&B's name
+        return self
+
+    def artifact(self, name, type):
+        self.asked.append((name, type))
+        if self.best is None:
+            raise ValueError("artifact not found")
+        return SimpleNamespace(metadata={"validation_error": self.best})
+
+    def Artifact(self, name, type, metadata):  # noqa: N802
+        return SimpleNamespace(name=name, add_file=lambda file, name: None)
+
+    def log_artifact(self, artifact, aliases):
+        self.logged.append((artifact.name, aliases))
+
+
+@pytest.mark.parametrize(
+    ("best", "error", "aliases"),
+    [
+        (None, 0.5, ["best", "latest"]),
+        (0.4, 0.5, ["latest"]),
+        (0.6, 0.5, ["best", "latest"]),
+        (0.6, None, ["latest"]),
+    ],
+)
+def test_online_the_best_map_of_all_is_the_best(tmp_path, best, error, aliases):
+    online = Online(best)
+    dashboard = object.__new__(Dashboard)
+    dashboard._run = dashboard._wandb = online
+    facts = {} if error is None else {"validation_error": error}
+    dashboard.add(FileSet("map-k2-01234567", "action-map", {}, facts))
+    assert online.logged == [("map-k2-01234567", aliases)]
+    if error is not None:
+        assert online.asked == [("somebody/nht/map-k2-01234567:best", "action-map")]
