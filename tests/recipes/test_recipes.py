@@ -364,11 +364,11 @@ def test_reporting_where_there_is_no_run(tmp_path):
 
 def test_the_training_of_a_map_stands_on_the_dashboard_with_what_it_was_made_from(demos, tmp_path):
     out = tmp_path / "maps" / "small.safetensors"
-    told = [f"demos.path={demos}", f"out={out}", "map.max_steps=250", "map.hidden=[8]", "seed=2"]
+    told = [f"demos.path={demos}", f"out={out}", "map.max_steps=600", "map.hidden=[8]", "seed=2"]
     train_map.main(configure(TrainMap, "train_map", told))
     found = wandb_file.read_run(out.parent)
     assert (found.run.display_name, found.run.job_type, found.exit_code) == ("small", "train_map", 0)
-    assert found.config["map"]["max_steps"] == 250
+    assert found.config["map"]["max_steps"] == 600
     errors = [row["map/validation_error"] for row in found.rows if "map/validation_error" in row]
     assert len(errors) > 1
     assert found.metrics["map/*"].step_metric == "map_steps"
