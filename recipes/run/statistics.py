@@ -81,10 +81,11 @@ class TrainingStatistics:
 
     def add_losses(self, losses: TensorDictBase) -> None:
         """Count one update; the sums stay tensors, so that nothing waits for the device."""
+        looks = self._updates % SAMPLED == 0  # at the first update already: a row then has a value
         self._updates += 1
         for name in self._losses:
             self._sums[name] = self._sums[name] + losses[name].detach().double()
-        if self._updates % SAMPLED == 0 and (value := _value(losses)) is not None:
+        if looks and (value := _value(losses)) is not None:
             self._sums[VALUE] = self._sums[VALUE] + value.detach().double()
 
     def add_steps(self, steps: TensorDictBase) -> None:
@@ -175,7 +176,7 @@ class TrainingStatistics:
         returns = (RETURN, LENGTH) if self._episode_sums is not None else ()
         names = (SUCCESS, FAILURE, DIVERGED, CLIPPED, *self._losses, *returns, VALUE)
         counted: Totals = {"updates": self._updates, "episodes": self._episodes, "steps": self._steps}
-        counted["sampled"] = self._updates // SAMPLED if VALUE in self._sums else 0
+        counted["sampled"] = -(-self._updates // SAMPLED) if VALUE in self._sums else 0
         return counted | {f"sum of {name}": self._sums.get(name, 0.0) for name in names}
 
     def _rows(

@@ -92,9 +92,10 @@ def test_the_value_is_sampled_every_tenth_update() -> None:
     statistics = TrainingStatistics(BOUNDS, losses=["loss"])
     for number in range(25):
         statistics.add_losses(updates([0.0], target=float(number))[0])
-    assert statistics.take()[0]["value"] == (9 + 19) / 2
-    statistics.add_losses(updates([0.0])[0])
+    assert statistics.take()[0]["value"] == (0 + 10 + 20) / 3
     assert math.isnan(statistics.take()[0]["value"])
+    statistics.add_losses(updates([0.0], target=5.0)[0])
+    assert statistics.take()[0]["value"] == 5.0
 
 
 def test_returns_are_means_over_the_episodes_that_ended() -> None:
