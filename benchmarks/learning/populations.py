@@ -16,7 +16,7 @@ import numpy as np
 import pandas
 from matplotlib.axes import Axes
 
-from nht.recipes.figure_style import PAGE, label_ends, save_figure, style, thousands
+from nht.recipes.figure_style import PAGE, save_figure, style, thousands
 from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
 from nht.recipes.study.curves import read_runs, summarise
 from nht.recipes.study.report import to_markdown
@@ -68,7 +68,8 @@ def plot(curves: pandas.DataFrame, file: Path, looks: Mapping[str, tuple[str, st
     task = curves["task"].iloc[0]
     axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03), title=task)
     thousands(axes)
-    label_ends(axes)
+    # Names at the ends of curves would not say which line is dashed.
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=3)
     save_figure(figure, file)
 
 
