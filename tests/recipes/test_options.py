@@ -7,6 +7,7 @@ import contextlib
 import sys
 from collections import defaultdict
 from dataclasses import dataclass, field, fields, is_dataclass
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -20,6 +21,7 @@ from nht.recipes import (
     report,
     search,
     train_map,
+    workspace,
 )
 from nht.recipes import config as schemas
 from nht.recipes.agents.table import ALGORITHMS, Algorithm
@@ -164,6 +166,10 @@ def test_every_option_is_read(reads, tmp_path, monkeypatch):
     run(compare_maps, schemas.CompareMaps, "compare_maps", *compared)
     run(export_map, schemas.ExportMap, "export_map", "file=map.safetensors", "out=map.pt2")
     run(report, schemas.Report, "report", "folder=runs")
+    monkeypatch.setattr(
+        workspace, "import_module", lambda _: MagicMock()
+    )  # an extra, whose views need a server
+    run(workspace, schemas.Workspace, "workspace", "entity=somebody")
     monkeypatch.setattr("nht.recipes.study.cluster.Cluster", InProcess)
     monkeypatch.setattr(Algorithm, "train", lambda *_: None)
     told = ["search=smoke", "search.best_seeds=0", "demos.path=demos", "folder=search"]
