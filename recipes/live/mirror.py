@@ -1,0 +1,118 @@
+"""A copy of a running simulator's state, to be looked at: poses, the tool, and what the motors do to it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from torchrl.envs import EnvBase
+
+from nht.envs.foreign_copies import ForeignTask
+from nht.envs.gymnasium_copies import NativeCopy
+from nht.envs.task import BatchedTask
+
+Array = NDArray[np.float64]
+
+
+class Source(Protocol):
+    """A simulator that steps elsewhere."""
+
+    model: mujoco.MjModel
+
+    def copy_into(self, data: mujoco.MjData) -> None:
+        """Write its state into ``data``."""
+
+    def decorate(self, scene: mujoco.MjvScene) -> None:
+        """Add what the model does not hold: goals, marks."""
+
+
+class TaskSource:
+    """The one copy of a task of ours."""
+
+    def __init__(self, task: BatchedTask) -> None:
+        self._task = task
+        self.model = task.model
+
+    def copy_into(self, data: mujoco.MjData) -> None:
+        """Write its state into ``data``."""
+        mujoco.mj_setState(self.model, data, self._task.state[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+
+    def decorate(self, scene: mujoco.MjvScene) -> None:
+        """Add what the model does not hold."""
+        self._task.decorate(scene, 0)
+
+
+class ForeignSource:
+    """The simulator of another library's environment."""
+
+    def __init__(self, simulator: Any) -> None:
+        self._simulator = simulator
+        self.model = simulator.model
+
+    def copy_into(self, data: mujoco.MjData) -> None:
+        """Write its state into ``data``."""
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self._simulator.data, state, kind)
+        mujoco.mj_setState(self.model, data, state, kind)
+
+    def decorate(self, scene: mujoco.MjvScene) -> None:
+        """Nothing: all is in the model."""
+
+
+def source_of(base: EnvBase, name: str) -> Source:
+    """The simulator behind an environment.
+
+    Args:
+        base: the task itself.
+        name: of the task, for the message.
+
+    Raises:
+        ValueError: if it is not MuJoCo's.
+    """
+    task = getattr(base, "task", None)
+    if isinstance(task, BatchedTask):
+        return TaskSource(task)
+    if isinstance(task, ForeignTask):
+        copy = task.copies[0]
+        if isinstance(copy, NativeCopy):
+            return TaskSource(copy.task)
+        simulator = getattr(copy, "simulator", None)
+        if simulator is not None:
+            return ForeignSource(simulator)
+    raise ValueError(
+        f"{name} has no MuJoCo model to draw: steer shows tasks of the table, and those of Gymnasium and dm_control on "
+        "MuJoCo."
+    )
+
+
+class Mirror:
+    """Poses of a running simulator.
+
+    Args:
+        source: the simulator.
+
+    Attributes:
+        model: the simulator's own.
+        data: the state when it was last looked at, with all that follows from it.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.model = source.model
+        self.data = mujoco.MjData(self.model)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=200)
+        self.look()
+
+    def look(self) -> None:
+        """Copy the state as it stands now."""
+        self._source.copy_into(self.data)
+        mujoco.mj_forward(self.model, self.data)
+
+    def marks(self) -> list[mujoco.MjvGeom]:
+        """What the task adds to the scene: goals, marks. Valid until the next call."""
+        self._scene.ngeom = 0
+        self._source.decorate(self._scene)
+        return list(self._scene.geoms[: self._scene.ngeom])

@@ -1,0 +1,51 @@
+"""Real time: when the next step is due, and when the next picture is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from nht.recipes.live.session import Session
+
+PICTURES = 50.0
+"""Pictures per second, at most."""
+PAUSE = 1.5
+"""Seconds for which the end of an episode stays to be seen."""
+BEHIND = 0.25
+"""Seconds by which steps may be late before the clock gives up on catching up."""
+
+
+def keep_pace(session: Session, show: Callable[[], object], going: Callable[[], bool] = lambda: True) -> None:
+    """Step a session in real time, times its speed, and show it, until ``going`` says no.
+
+    Steps are made when they are due, one for each picture or several; a picture follows the step. While nothing moves,
+    pictures go on, so that what people press shows at once.
+
+    Args:
+        session: what is stepped.
+        show: draws it.
+        going: asked before every turn.
+    """
+    clock = time.monotonic
+    due = shown = clock()
+    ended_at: float | None = None
+    while going():
+        session.settle()
+        now = clock()
+        period = float(session.task.time_per_step) / max(session.speed, 1e-3)
+        if session.ended and session.goes_on:
+            ended_at = now if ended_at is None else ended_at
+            if now - ended_at > PAUSE:
+                session.next_goal()
+        else:
+            ended_at = None
+        if now >= due:
+            session.step()
+            due = due + period if now - due < BEHIND else now + period
+        now = clock()
+        if now - shown >= 1.0 / PICTURES:
+            shown = now
+            show()
+        wait = min(due, shown + 1.0 / PICTURES) - clock()
+        if wait > 0:
+            time.sleep(min(wait, 1.0 / PICTURES))

@@ -1,0 +1,145 @@
+"""The page in the browser: the scene, the basis in it, the panel, and the pads of all who look."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import redirect_stdout
+from io import StringIO
+from typing import Any
+
+import mujoco
+import numpy as np
+from viser import ViserServer
+
+from nht.recipes.live.basis import COLOURS, Arrows, Basis, bars_html, present_basis
+from nht.recipes.live.controls import Controls
+from nht.recipes.live.door import LOCAL, Door
+from nht.recipes.live.mirror import Mirror
+from nht.recipes.live.session import Session
+from nht.recipes.live.stage import Stage
+from nht.recipes.live.tool import Tool
+
+TRAIL = 400
+"""Points of the tool's trail, at most."""
+TRAIL_COLOUR = (38, 89, 217)
+WRITE_EVERY = 5
+"""Frames between two changes of what is written."""
+
+
+class Page:
+    """Shows a session to everybody who comes through a door, and lets them steer it.
+
+    Args:
+        session: what is shown.
+        mirror: the session's simulator.
+        tool: the point that is drawn.
+        door: where browsers come in.
+    """
+
+    def __init__(self, session: Session, mirror: Mirror, tool: Tool, door: Door) -> None:
+        self._session, self._mirror, self._tool, self._door = session, mirror, tool, door
+        with redirect_stdout(StringIO()):  # it prints an address that is not for people
+            self._server = ViserServer(host=LOCAL, port=0, label="nht steer", verbose=False)
+        scene = self._server.scene
+        self._server.gui.configure_theme(
+            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
+        )
+        scene.world_axes.visible = False
+        self._stage = Stage(scene, mirror)
+        self._arrows = Arrows(scene, float(mirror.model.stat.extent))
+        self._controls = Controls(self._server.gui, session)
+        self._trail: deque[Any] = deque(maxlen=TRAIL)
+        self._trail_node: Any = None
+        self._motors = motor_names(mirror.model, session.base.action_spec.shape[-1])
+        self._frames, self._episode, self._told_axes = 0, session.episode, ""
+        self._told_action: list[float] = []
+        self._look_through_camera()
+        session.commands.on_reached = lambda pad, stamp: door.tell({"reached": stamp}, str(pad))
+        self._tell_pads()
+        door.open(self._server.get_port(), self._heard)
+
+    def _heard(self, pad: str, said: dict[str, Any]) -> None:
+        """What a pad says, in the door's thread."""
+        action, stamp = said.get("action"), said.get("stamp", 0.0)
+        if not said:
+            self._session.commands.drop(pad)
+        elif isinstance(action, list) and all(isinstance(each, int | float) for each in action):
+            self._session.commands.ask(action, pad, float(stamp) if isinstance(stamp, int | float) else 0.0)
+
+    def show(self) -> None:
+        """Send what has changed since the last time, to everybody."""
+        now = self._session
+        self._mirror.look()
+        self._frames += 1
+        if now.episode != self._episode:
+            self._episode = now.episode
+            self._trail.clear()
+            self._stage.renew()
+        basis = present_basis(now, self._tool)
+        place = self._tool.position
+        with self._server.atomic():
+            self._stage.update()
+            self._arrows.update(basis if self._controls.arrows.value else None, place)
+            self._draw_trail(place)
+        if self._frames % WRITE_EVERY == 0:
+            self._controls.tell(self._bars(basis))
+        self._tell_pads()
+
+    def _bars(self, basis: Basis) -> str:
+        spec = self._session.base.action_spec.space
+        bounds = tuple(end.reshape(-1).double().numpy() for end in (spec.low, spec.high))
+        return bars_html(basis, self._motors, self._session.actuation[0].double().numpy(), (bounds[0], bounds[1]))
+
+    def _draw_trail(self, place: Any) -> None:
+        if self._trail and np.linalg.norm(place - self._trail[-1]) < 1e-3:
+            return
+        self._trail.append(place)
+        if self._frames % 2 and self._trail_node is not None:
+            return
+        points = np.array(self._trail, dtype=np.float32)
+        if len(points) < 2 or not self._controls.trail.value:
+            points = np.repeat(points[:1], 2, axis=0)
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        if self._trail_node is None:
+            self._trail_node = self._server.scene.add_line_segments(
+                "/trail", segments, np.array(TRAIL_COLOUR, dtype=np.uint8), line_width=3.0
+            )
+        else:
+            self._trail_node.points = segments
+
+    def _tell_pads(self) -> None:
+        name = self._session.interface.name
+        if name != self._told_axes:
+            self._told_axes = name
+            axes = self._session.interface.action_dim
+            self._door.tell({"axes": axes, "colours": COLOURS, "action": [0.0] * axes})
+        action = self._session.commands.latest()[0].tolist()
+        if action != self._told_action:
+            self._told_action = action
+            self._door.tell({"action": action})
+
+    def _look_through_camera(self) -> None:
+        """Start where the model's first camera is, if it stands still, or else before the whole model."""
+        model, data, view = self._mirror.model, self._mirror.data, self._server.initial_camera
+        centre, extent = np.array(model.stat.center), float(model.stat.extent)
+        if model.ncam and model.cam_bodyid[0] == 0:
+            place, turn = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3)
+            away = max(float(np.dot(centre - place, -turn[:, 2])), 0.2 * extent)
+            view.position, view.look_at = place, place - away * turn[:, 2]
+            view.fov = float(np.radians(model.cam_fovy[0]))
+        else:
+            view.look_at, view.position = centre, centre + extent * np.array([0.9, -1.4, 0.7])
+
+    def close(self) -> None:
+        """Close the door and the viewer."""
+        self._door.close()
+        with redirect_stdout(StringIO()):
+            self._server.stop()
+
+
+def motor_names(model: mujoco.MjModel, motors: int) -> list[str]:
+    """The names of the motors: those of the model's actuators, of its joints, or numbers, as many as there are."""
+    actuators = [model.actuator(i).name for i in range(model.nu)]
+    joints = [model.joint(i).name for i in range(model.njnt)]
+    names = next((found for found in (actuators, joints) if len(found) == motors), [""] * motors)
+    return [name or f"motor {number + 1}" for number, name in enumerate(names)]
