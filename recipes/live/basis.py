@@ -66,9 +66,7 @@ class Arrows:
     def update(self, basis: Basis | None, tool: Array) -> None:
         """Draw the arrows of a basis at ``tool`` [m], ``(3,)``; None draws none."""
         ways = np.zeros((0, 3)) if basis is None else arrow_ways(basis, self._extent)
-        shown = {
-            axis: way for axis, way in enumerate(ways) if np.linalg.norm(way) > SHORTEST * self._extent
-        }
+        shown = {axis: way for axis, way in enumerate(ways) if np.linalg.norm(way) > SHORTEST * self._extent}
         for axis in self._axes.keys() - shown.keys():
             self._axes.pop(axis)[0].remove()  # type: ignore[attr-defined]
         for axis, way in shown.items():
@@ -77,11 +75,11 @@ class Arrows:
     def _draw(self, axis: int, way: Array, tool: Array) -> None:
         points = np.stack([tool, tool + way])[None]
         if axis not in self._axes:
-            thick = 0.012 * self._extent
+            thick = 0.011 * self._extent
             node = self._scene.add_arrows(
                 f"/basis/{axis}",
                 points,
-                rgb(COLOURS[axis % len(COLOURS)]),
+                linear_rgb(COLOURS[axis % len(COLOURS)]),
                 shaft_radius=0.35 * thick,
                 head_radius=thick,
                 head_length=2.5 * thick,
@@ -111,6 +109,12 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
+def linear_rgb(colour: str) -> tuple[int, int, int]:
+    """A colour as the viewer's arrows take it, in proportion to light: they are not corrected for the eye."""
+    red, green, blue = (round(255 * (part / 255) ** 2.2) for part in rgb(colour))
+    return red, green, blue
+
+
 def bars_html(basis: Basis, motors: list[str], actuation: Array, bounds: tuple[Array, Array]) -> str:
     """Bars for people to read: each motor's part in each axis, and what it gets now.
 
@@ -126,7 +130,8 @@ def bars_html(basis: Basis, motors: list[str], actuation: Array, bounds: tuple[A
     rows = []
     for name, parts, now, most in zip(motors, basis.effects, actuation, limit, strict=True):
         bars = [
-            _bar(part / largest, 2 + 4 * axis, COLOURS[axis % len(COLOURS)]) for axis, part in enumerate(parts)
+            _bar(part / largest, 2 + 4 * axis, COLOURS[axis % len(COLOURS)])
+            for axis, part in enumerate(parts)
         ]
         bars.append(_bar(float(now) / max(float(most), 1e-9), height - 3, "#888"))
         rows.append(

@@ -34,21 +34,24 @@ class Controls:
         self._shown: dict[int, str] = {}
         self._values: list[float] = []
         self._status = gui.add_html("")
-        height = 232 if max(each.action_dim for each in session.interfaces.values()) <= 9 else 360
+        height = 222 if max(each.action_dim for each in session.interfaces.values()) <= 9 else 360
         gui.add_html(
             f'<iframe id="pad" title="pad" allow="gamepad" style="width:100%;height:{height}px;border:0" '
             f'srcdoc="{escape(PAD.read_text())}"></iframe>'
         )
-        self._choose = gui.add_dropdown("Interface", list(session.interfaces), initial_value=session.interface.name)
+        self._choose = gui.add_dropdown(
+            "Interface", list(session.interfaces), initial_value=session.interface.name
+        )
         self._on(self._choose, lambda now, value: now.choose(value))
         drivers = (PERSON,) if session.pilot is None else (PERSON, POLICY)
         self._drive = gui.add_dropdown(
             "Driver", drivers, initial_value=session.driver, hint="A hand on the pad takes over at any time."
         )
         self._on(self._drive, lambda now, value: now.drive(value))
-        self._button("Next goal", lambda now: now.next_goal())
-        self._button("Reset", lambda now: now.reset())
-        self._speed = gui.add_slider("Speed", min=0.1, max=max(2.0, session.speed), step=0.1, initial_value=session.speed)
+        self._buttons("Episode", {"Next goal": lambda now: now.next_goal(), "Reset": lambda now: now.reset()})
+        self._speed = gui.add_slider(
+            "Speed", min=0.1, max=max(2.0, session.speed), step=0.1, initial_value=session.speed
+        )
         self._on(self._speed, lambda now, value: setattr(now, "speed", float(value)))
         self._checkbox("Pause", False, lambda now, value: setattr(now, "paused", value))
         self._checkbox("Go on by itself", session.goes_on, lambda now, value: setattr(now, "goes_on", value))
@@ -58,9 +61,12 @@ class Controls:
             self._bars = gui.add_html("")
         with gui.add_folder("Record"):
             self._recording = gui.add_html("")
-            self._record = self._button("Record", lambda now: now.record(not now.recorder.on))
-            self._button("Discard episode", lambda now: now.recorder.discard())
-            self._button("Save", lambda now: now.save())
+            self._record = gui.add_button("Record")
+            self._record.on_click(lambda _: session.post(lambda now: now.record(not now.recorder.on)))
+            self._buttons(
+                "Episodes",
+                {"Save": lambda now: now.save(), "Discard last": lambda now: now.recorder.discard()},
+            )
         self._message = gui.add_html("")
 
     def _on(self, control: Any, change: Callable[[Session, Any], object]) -> None:
@@ -70,10 +76,9 @@ class Controls:
             if event.client is not None:  # not what we set ourselves
                 self._session.post(lambda now: change(now, value))
 
-    def _button(self, label: str, change: Callable[[Session], object]) -> Any:
-        button = self._gui.add_button(label)
-        button.on_click(lambda _: self._session.post(change))
-        return button
+    def _buttons(self, label: str, changes: dict[str, Callable[[Session], object]]) -> None:
+        group = self._gui.add_button_group(label, list(changes))
+        group.on_click(lambda event: self._session.post(changes[event.target.value]))
 
     def _checkbox(self, label: str, value: bool, change: Callable[[Session, bool], object]) -> None:
         self._on(self._gui.add_checkbox(label, value), change)
@@ -111,7 +116,9 @@ def _line(text: str) -> str:
 
 def _status(now: Session, values: list[float]) -> str:
     colour = OUTCOMES.get(now.outcome, "#b7791f")
-    through = now.pilot.interface.name if now.pilot is not None and now.driving == POLICY else now.interface.name
+    through = (
+        now.pilot.interface.name if now.pilot is not None and now.driving == POLICY else now.interface.name
+    )
     told = (
         f'<span data-clock>{now.seconds:.1f} s</span> &nbsp; <b data-outcome style="color:{colour}">{now.outcome}</b>'
         f" &nbsp; {now.driving} through {escape(through)}"
@@ -122,8 +129,14 @@ def _status(now: Session, values: list[float]) -> str:
     if now.pilot is not None and now.pilot.critic is None:
         lines.append(_line(escape(now.pilot.no_critic)))
     elif values:
-        of = "this action" if now.pilot and now.pilot.critic and now.pilot.critic.judges_actions else "the state"
-        lines.append(_line(f"<span data-value>the critic expects {values[-1]:.2f}</span> of {of}{_spark(values)}"))
+        of = (
+            "this action"
+            if now.pilot and now.pilot.critic and now.pilot.critic.judges_actions
+            else "the state"
+        )
+        lines.append(
+            _line(f"<span data-value>the critic expects {values[-1]:.2f}</span> of {of}{_spark(values)}")
+        )
     return "".join(lines)
 
 
@@ -143,5 +156,5 @@ def _recording(now: Session) -> str:
     kept = now.recorder
     dot = '<span style="color:#c82828">●</span> recording' if kept.on else "not recording"
     return _line(
-        f'{dot}: <span data-recorded>{kept.transitions}</span> steps, {len(kept.episodes)} whole episodes'
+        f"{dot}: <span data-recorded>{kept.transitions}</span> steps, {len(kept.episodes)} whole episodes"
     )

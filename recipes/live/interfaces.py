@@ -66,16 +66,25 @@ class Interface:
 
     @torch.no_grad()
     def decode(self, action: Tensor, observed: TensorDictBase) -> Tensor:
-        """The actuation ``(1, n)`` for an action ``(1, k)`` in [-1, 1]^k: scaled, offset and saturated as in training."""
-        given = TensorDict({"action": action, "context": self.context(observed)}, batch_size=[1])
-        return self._transform.inv(given)["action"]
+        """The actuation for an action in [-1, 1]^k: scaled, offset and saturated as in training.
 
-    @torch.no_grad()
+        Args:
+            action: ``(1, k)``, or several for the one state, ``(A, k)``.
+            observed: raw observations, ``(1,)``.
+
+        Returns:
+            ``(A, n)``.
+        """
+        context = self.context(observed).expand(len(action), -1)
+        given = TensorDict({"action": action, "context": context}, batch_size=[len(action)])
+        actuation: Tensor = self._transform.inv(given)["action"]
+        return actuation
+
     def axis_effects(self, observed: TensorDictBase) -> Tensor:
         """Q as the motors feel it: the change of the actuation from action 0 to 1 on each axis, ``(n, k)``."""
-        still = self.decode(torch.zeros(1, self.action_dim), observed)
-        ways = [self.decode(axis[None], observed) - still for axis in torch.eye(self.action_dim)]
-        return torch.cat(ways).T
+        axes = torch.eye(self.action_dim)
+        found = self.decode(torch.cat([torch.zeros(1, self.action_dim), axes]), observed)
+        return (found[1:] - found[0]).T
 
 
 def kind_name(map: nht.ActionMap) -> str:

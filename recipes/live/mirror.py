@@ -111,6 +111,15 @@ class Mirror:
         self._source.copy_into(self.data)
         mujoco.mj_forward(self.model, self.data)
 
+    def moving_parts(self) -> tuple[Array, float]:
+        """Centre ``(3,)`` and radius [m] of what can move, as it stands now: of the robot, without floor and tables."""
+        moves = self.model.body_weldid[self.model.geom_bodyid] != 0
+        if not moves.any():
+            return np.array(self.model.stat.center), float(self.model.stat.extent)
+        places, reach = self.data.geom_xpos[moves], self.model.geom_rbound[moves][:, None]
+        low, high = (places - reach).min(axis=0), (places + reach).max(axis=0)
+        return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+
     def marks(self) -> list[mujoco.MjvGeom]:
         """What the task adds to the scene: goals, marks. Valid until the next call."""
         self._scene.ngeom = 0

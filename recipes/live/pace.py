@@ -10,7 +10,7 @@ from nht.recipes.live.session import Session
 PICTURES = 50.0
 """Pictures per second, at most."""
 PAUSE = 1.5
-"""Seconds for which the end of an episode stays to be seen."""
+"""Seconds for which an end, or the goal, stays to be seen before the next episode begins by itself."""
 BEHIND = 0.25
 """Seconds by which steps may be late before the clock gives up on catching up."""
 
@@ -33,10 +33,11 @@ def keep_pace(session: Session, show: Callable[[], object], going: Callable[[], 
         session.settle()
         now = clock()
         period = float(session.task.time_per_step) / max(session.speed, 1e-3)
-        if session.ended and session.goes_on:
+        if session.at_rest and session.goes_on and not session.paused:
             ended_at = now if ended_at is None else ended_at
             if now - ended_at > PAUSE:
                 session.next_goal()
+                ended_at = None
         else:
             ended_at = None
         if now >= due:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from contextlib import redirect_stdout
 from io import StringIO
@@ -15,13 +16,17 @@ from nht.recipes.live.basis import COLOURS, Arrows, Basis, bars_html, present_ba
 from nht.recipes.live.controls import Controls
 from nht.recipes.live.door import LOCAL, Door
 from nht.recipes.live.mirror import Mirror
-from nht.recipes.live.session import Session
+from nht.recipes.live.session import POLICY, Session
 from nht.recipes.live.stage import Stage
 from nht.recipes.live.tool import Tool
 
 TRAIL = 400
 """Points of the tool's trail, at most."""
 TRAIL_COLOUR = (38, 89, 217)
+LIGHT = 0.35
+"""Of the surroundings, beside the viewer's own lamps."""
+AWAY = 1.3
+"""How much farther than the model's camera people stand: the panel takes a part of the picture."""
 WRITE_EVERY = 5
 """Frames between two changes of what is written."""
 
@@ -45,14 +50,15 @@ class Page:
             control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
         )
         scene.world_axes.visible = False
+        scene.configure_environment_map("studio", environment_intensity=LIGHT)
         self._stage = Stage(scene, mirror)
-        self._arrows = Arrows(scene, float(mirror.model.stat.extent))
+        self._arrows = Arrows(scene, mirror.moving_parts()[1])
         self._controls = Controls(self._server.gui, session)
         self._trail: deque[Any] = deque(maxlen=TRAIL)
         self._trail_node: Any = None
         self._motors = motor_names(mirror.model, session.base.action_spec.shape[-1])
         self._frames, self._episode, self._told_axes = 0, session.episode, ""
-        self._told_action: list[float] = []
+        self._told_action: tuple[str, list[float]] = ("", [])
         self._look_through_camera()
         session.commands.on_reached = lambda pad, stamp: door.tell({"reached": stamp}, str(pad))
         self._tell_pads()
@@ -88,7 +94,9 @@ class Page:
     def _bars(self, basis: Basis) -> str:
         spec = self._session.base.action_spec.space
         bounds = tuple(end.reshape(-1).double().numpy() for end in (spec.low, spec.high))
-        return bars_html(basis, self._motors, self._session.actuation[0].double().numpy(), (bounds[0], bounds[1]))
+        return bars_html(
+            basis, self._motors, self._session.actuation[0].double().numpy(), (bounds[0], bounds[1])
+        )
 
     def _draw_trail(self, place: Any) -> None:
         if self._trail and np.linalg.norm(place - self._trail[-1]) < 1e-3:
@@ -113,22 +121,26 @@ class Page:
             self._told_axes = name
             axes = self._session.interface.action_dim
             self._door.tell({"axes": axes, "colours": COLOURS, "action": [0.0] * axes})
-        action = self._session.commands.latest()[0].tolist()
-        if action != self._told_action:
-            self._told_action = action
-            self._door.tell({"action": action})
+        now = self._session
+        by_policy = now.driving == POLICY and now.action.shape[-1] == now.interface.action_dim
+        key = "driven" if by_policy else "action"
+        action = (now.action if by_policy else now.commands.latest())[0].tolist()
+        if (key, action) != self._told_action:
+            self._told_action = key, action
+            self._door.tell({key: [round(part, 3) for part in action]})
 
     def _look_through_camera(self) -> None:
-        """Start where the model's first camera is, if it stands still, or else before the whole model."""
+        """Start behind the model's first camera, if it stands still, or else beside the robot."""
         model, data, view = self._mirror.model, self._mirror.data, self._server.initial_camera
-        centre, extent = np.array(model.stat.center), float(model.stat.extent)
+        centre, radius = self._mirror.moving_parts()
         if model.ncam and model.cam_bodyid[0] == 0:
-            place, turn = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3)
-            away = max(float(np.dot(centre - place, -turn[:, 2])), 0.2 * extent)
-            view.position, view.look_at = place, place - away * turn[:, 2]
+            place, backwards = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3)[:, 2]
+            at = place - max(float(np.dot(place - centre, backwards)), 0.5 * radius) * backwards
+            view.look_at, view.position = at, at + AWAY * (place - at)
             view.fov = float(np.radians(model.cam_fovy[0]))
         else:
-            view.look_at, view.position = centre, centre + extent * np.array([0.9, -1.4, 0.7])
+            view.look_at, view.position = centre, centre + radius * np.array([0.8, -2.4, 0.9])
+            view.fov = math.radians(45)
 
     def close(self) -> None:
         """Close the door and the viewer."""

@@ -7,8 +7,6 @@ from queue import SimpleQueue
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
@@ -45,7 +43,7 @@ class Session:
         ended: whether the episode has ended; the task then waits for a reset or the next goal.
         paused: whether the task stands still.
         speed: as a multiple of real time.
-        goes_on: whether the next episode begins by itself.
+        goes_on: whether the next episode begins by itself, after an end or at the goal.
         message: what was last done or went wrong, for people to read.
         commands: what people ask for.
     """
@@ -88,6 +86,11 @@ class Session:
         if self.succeeded:
             return SUCCESS
         return OVER if self.ended else RUNNING
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether there is nothing left to do: the episode has ended, or the task is done."""
+        return self.ended or (self.succeeded and not self.failed)
 
     def post(self, change: Callable[[Session], object]) -> None:
         """Let the thread that steps make a change before its next step."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -25,7 +25,7 @@ G = mujoco.mjtGeom
 
 @dataclass(frozen=True)
 class Shape:
-    """A geom: its kind and sizes as MuJoCo has them, its colour, and the mesh of those that are none of the simple ones.
+    """A geom: its kind and sizes as MuJoCo has them, its colour, and its mesh if it is none of the simple ones.
 
     Attributes:
         kind: of the geom.
@@ -39,7 +39,7 @@ class Shape:
     size: tuple[float, float, float]
     colour: Colour
     opacity: float
-    mesh: tuple[Array, NDArray[np.int32]] | None = None
+    mesh: tuple[Array, NDArray[np.int32]] | None = field(default=None, compare=False)  # follows from the rest
 
 
 def shape_of_geom(model: mujoco.MjModel, geom: int) -> Shape | None:
@@ -54,6 +54,14 @@ def shape_of_geom(model: mujoco.MjModel, geom: int) -> Shape | None:
     if kind == G.mjGEOM_HFIELD:
         return Shape(kind, (1.0, 1.0, 1.0), *_parted(rgba), _terrain(model, int(model.geom_dataid[geom])))
     return simple_shape(kind, model.geom_size[geom], rgba)
+
+
+def shape_of_mark(mark: mujoco.MjvGeom) -> Shape | None:
+    """A geom of an abstract scene, which has the length of what is round at another place than a model has."""
+    size = np.array(mark.size, dtype=np.float64)
+    if mark.type in (G.mjGEOM_CAPSULE, G.mjGEOM_CYLINDER):
+        size[1] = size[2]
+    return simple_shape(mark.type, size, mark.rgba)
 
 
 def simple_shape(kind: int, size: Array, rgba: NDArray[np.floating]) -> Shape | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from viser import SceneApi
 
 from nht.recipes.live.mirror import Mirror
-from nht.recipes.live.shapes import G, Shape, shape_of_geom, simple_shape
+from nht.recipes.live.shapes import G, Shape, shape_of_geom, shape_of_mark
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class Stage:
         found = [
             (shape, np.array(mark.pos, dtype=np.float64), quaternion(mark.mat))
             for mark in self._mirror.marks()
-            if (shape := simple_shape(mark.type, np.array(mark.size, dtype=np.float64), mark.rgba)) is not None
+            if (shape := shape_of_mark(mark)) is not None
         ]
         if [shape for shape, _ in self._marks] != [shape for shape, _, _ in found]:
             for _, placed in self._marks:
