@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 import nht
 from nht.recipes.maps.interface import trained_map
-from nht.recipes.maps.kinds import KINDS, arm_of, find_kind, task_context_keys, tasks_with_arm
+from nht.recipes.maps.kinds import KINDS, arm_of, find_kind, known_task, task_context_keys, tasks_with_arm
 from nht.recipes.sections import DemosConfig, EnvConfig, MapConfig
 from nht.transforms import ActionMapTransform
 from nht.transforms.context import read_context
@@ -152,7 +152,7 @@ class Choices:
             told = str(error.args[0]).removesuffix(".")
             raise ValueError(
                 f"{source or f'the map {name}'} does not fit {self._env.name}: {told}. Train one that does: "
-                f"python -m nht.recipes.train_map {_chosen(self._env)} map=nht out=runs/nht.safetensors."
+                f"python -m nht.recipes.train_map {_demonstrated(self._env)} map=nht out=runs/nht.safetensors."
             ) from error
         return self.found[own]
 
@@ -193,3 +193,10 @@ class Choices:
 def _chosen(env: EnvConfig) -> str:
     """A task as it is chosen on a command line."""
     return f"env={env.name}" if env.suite == "nht" else f"env={env.suite} env.name={env.name}"
+
+
+def _demonstrated(env: EnvConfig) -> str:
+    """A task as ``train_map`` takes it: one without an expert needs a folder of demonstrations."""
+    task = known_task(env)
+    has_expert = task is not None and task.expert is not None
+    return _chosen(env) if has_expert else f"{_chosen(env)} demos.path=FOLDER"
