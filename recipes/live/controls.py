@@ -7,9 +7,13 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from viser import GuiApi
 
 from nht.recipes.live.session import FAILED, PERSON, POLICY, RUNNING, SUCCESS, Session
+
+Array = NDArray[np.float64]
 
 PAD = Path(__file__).parent / "pad.html"
 OUTCOMES = {RUNNING: "#777", SUCCESS: "#1e963c", FAILED: "#c82828"}
@@ -83,16 +87,17 @@ class Controls:
     def _checkbox(self, label: str, value: bool, change: Callable[[Session, bool], object]) -> None:
         self._on(self._gui.add_checkbox(label, value), change)
 
-    def tell(self, bars: str) -> None:
+    def tell(self, bars: str, tool: Array) -> None:
         """Bring what is written up to date.
 
         Args:
             bars: of the basis, as HTML.
+            tool: where it is [m], ``(3,)``.
         """
         now = self._session
         if now.pilot is not None and (value := now.value()) is not None and not now.ended:
             self._values = [*self._values[-SPARK + 1 :], value]
-        self._write(self._status, _status(now, self._values))
+        self._write(self._status, _status(now, self._values, tool))
         self._write(self._bars, bars)
         self._write(self._recording, _recording(now))
         self._write(self._message, _line(escape(now.message)) if now.message else "")
@@ -114,7 +119,7 @@ def _line(text: str) -> str:
     return f'<div style="padding:0.2em 0.9em;font-size:0.82em;overflow-wrap:anywhere">{text}</div>'
 
 
-def _status(now: Session, values: list[float]) -> str:
+def _status(now: Session, values: list[float], tool: Array) -> str:
     colour = OUTCOMES.get(now.outcome, "#b7791f")
     through = (
         now.pilot.interface.name if now.pilot is not None and now.driving == POLICY else now.interface.name
@@ -125,7 +130,8 @@ def _status(now: Session, values: list[float]) -> str:
     )
     if now.paused:
         told += " &nbsp; paused"
-    lines = [_line(told)]
+    place = " ".join(f"{part:.3f}" for part in tool)
+    lines = [_line(told), _line(f"tool at <span data-tool>{place}</span> m")]
     if now.pilot is not None and now.pilot.critic is None:
         lines.append(_line(escape(now.pilot.no_critic)))
     elif values:

@@ -88,7 +88,7 @@ class Page:
             self._arrows.update(basis if self._controls.arrows.value else None, place)
             self._draw_trail(place)
         if self._frames % WRITE_EVERY == 0:
-            self._controls.tell(self._bars(basis))
+            self._controls.tell(self._bars(basis), place)
         self._tell_pads()
 
     def _bars(self, basis: Basis) -> str:

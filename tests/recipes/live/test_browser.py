@@ -1,5 +1,6 @@
 """The page in a real browser, headless: what people see, drag, press and record."""
 
+import math
 import re
 import signal
 import subprocess
@@ -68,7 +69,7 @@ def opened():
         yield started
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def page(steering, opened):
     found = open_page(opened, steering.address)
     yield found
@@ -99,9 +100,20 @@ def basis_now(page):
     )
 
 
-def scene(page):
-    """The picture of the scene alone, without the panel."""
-    return page.locator("canvas").first.screenshot()
+def tool_now(page):
+    """Where the tool is [m]."""
+    return [float(part) for part in page.locator("[data-tool]").inner_text().split()]
+
+
+def picture(page):
+    """The scene, without the panel, once nothing in it changes any more."""
+    place = page.locator("canvas[data-engine]").bounding_box()
+    shots = [b"", b" "]
+    end = time.monotonic() + 60
+    while shots[-1] != shots[-2]:
+        assert time.monotonic() < end, "the picture never stands still"
+        shots.append(page.screenshot(clip=place))
+    return shots[-1]
 
 
 def test_the_page_loads_and_asks_nothing_of_other_machines(page, steering):
@@ -115,23 +127,30 @@ def test_the_page_loads_and_asks_nothing_of_other_machines(page, steering):
 
 def test_a_drag_on_the_pad_moves_the_tool_and_letting_go_stops_it(page):
     press(page, "Next goal")
-    until(lambda: not any(joints_now(page)))
-    before = scene(page)
+    before, seen = tool_now(page), picture(page)
     with held(page, 0.9, 0.0):
-        until(lambda: max(joints_now(page)) > 5)
-        time.sleep(0.5)
+        until(lambda: math.dist(tool_now(page), before) > 0.05)
     until(lambda: not any(joints_now(page)))
+    after = tool_now(page)
+    assert picture(page) != seen
+    assert tool_now(page) == after
     assert page.evaluate("steerLatency.length") > 0
-    until(lambda: scene(page) != before)
 
 
 def test_arrow_keys_drive_and_are_not_the_camera_s(page):
     choose(page, "nht")
-    page.locator("canvas").first.click(position={"x": 30, "y": 300})
+    press(page, "Next goal")
+    before = tool_now(page)
+    page.locator("canvas[data-engine]").click(position={"x": 30, "y": 300})
     page.keyboard.down("ArrowUp")
-    until(lambda: max(joints_now(page)) > 5)
+    until(lambda: math.dist(tool_now(page), before) > 0.05)
     page.keyboard.up("ArrowUp")
     until(lambda: not any(joints_now(page)))
+    page.get_by_label("Interface").focus()  # where arrow keys have another meaning
+    after = tool_now(page)
+    page.keyboard.press("ArrowUp", delay=500)
+    page.keyboard.press("Escape")
+    assert tool_now(page) == after
 
 
 def test_a_game_pad_drives(page):
@@ -146,10 +165,10 @@ def test_another_interface_changes_arrows_bars_and_sliders(page):
     frame = page.frame_locator("#pad")
     choose(page, "nht")
     until(lambda: len(basis_now(page)) == 14)
-    bars, picture = basis_now(page), scene(page)
+    bars, seen = basis_now(page), picture(page)
     choose(page, "svd")
     until(lambda: basis_now(page) != bars)
-    until(lambda: scene(page) != picture)
+    assert picture(page) != seen  # nothing but the arrows can have changed
     choose(page, "joints")
     until(lambda: frame.locator("input[type=range]").count() == 5)
     choose(page, "jacobian")
