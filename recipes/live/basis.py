@@ -6,11 +6,13 @@ import math
 from dataclasses import dataclass
 from html import escape
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi
 
 from nht.recipes.live.session import Session
+from nht.recipes.live.stage import Placed
 from nht.recipes.live.tool import Tool, angle_to_jacobian, rises
 
 Array = NDArray[np.float64]
@@ -21,6 +23,10 @@ AHEAD = 0.4
 """An arrow ends where the tool would be after so many seconds of an action of 1 on its axis alone."""
 LONGEST = 0.25
 """Length of the longest arrow where actuations accelerate the tool, as a share of the model's extent."""
+NOTICED = 0.02
+"""A smaller change of an arrow's length, as a share of it, is not sent."""
+X_TO_Z = np.array([math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0])
+"""The quaternion that turns x to z."""
 SHORTEST = 0.004
 """A shorter arrow is left out, as a share of the model's extent."""
 
@@ -54,6 +60,9 @@ def present_basis(session: Session, tool: Tool) -> Basis:
 class Arrows:
     """Arrows at the tool, one for each action axis.
 
+    An arrow is drawn along x and turned: browsers follow poses quickly, but new lengths slowly: those are sent only
+    when they have changed by more than ``NOTICED``.
+
     Args:
         scene: of the viewer.
         extent: of the model [m].
@@ -61,35 +70,46 @@ class Arrows:
 
     def __init__(self, scene: SceneApi, extent: float) -> None:
         self._scene, self._extent = scene, extent
-        self._axes: dict[int, tuple[object, Array]] = {}
+        self._axes: dict[int, tuple[Placed, float]] = {}
 
     def update(self, basis: Basis | None, tool: Array) -> None:
         """Draw the arrows of a basis at ``tool`` [m], ``(3,)``; None draws none."""
         ways = np.zeros((0, 3)) if basis is None else arrow_ways(basis, self._extent)
-        shown = {axis: way for axis, way in enumerate(ways) if np.linalg.norm(way) > SHORTEST * self._extent}
-        for axis in self._axes.keys() - shown.keys():
-            self._axes.pop(axis)[0].remove()  # type: ignore[attr-defined]
-        for axis, way in shown.items():
-            self._draw(axis, way, tool)
+        lengths = np.linalg.norm(ways, axis=1)
+        shown = {int(axis) for axis in np.flatnonzero(lengths > SHORTEST * self._extent)}
+        for axis in self._axes.keys() - shown:
+            self._axes.pop(axis)[0].node.remove()
+        for axis in sorted(shown):
+            self._draw(axis, ways[axis], float(lengths[axis]), tool)
 
-    def _draw(self, axis: int, way: Array, tool: Array) -> None:
-        points = np.stack([tool, tool + way])[None]
+    def _draw(self, axis: int, way: Array, length: float, tool: Array) -> None:
         if axis not in self._axes:
-            thick = 0.011 * self._extent
-            node = self._scene.add_arrows(
-                f"/basis/{axis}",
-                points,
-                linear_rgb(COLOURS[axis % len(COLOURS)]),
-                shaft_radius=0.35 * thick,
-                head_radius=thick,
-                head_length=2.5 * thick,
-            )
-            self._axes[axis] = (node, points)
-            return
-        node, before = self._axes[axis]
-        if np.abs(points - before).max() > 1e-5:
-            node.points = points.astype(np.float32)  # type: ignore[attr-defined]
-            self._axes[axis] = (node, points)
+            self._axes[axis] = self._made(axis, length), length
+        arrow, before = self._axes[axis]
+        if abs(length - before) > NOTICED * before:
+            arrow.node.points = _along_x(length)
+            self._axes[axis] = arrow, length
+        turn = np.zeros(4)
+        mujoco.mju_quatZ2Vec(turn, way)
+        full = np.zeros(4)
+        mujoco.mju_mulQuat(full, turn, X_TO_Z)
+        arrow.move(tool, full)
+
+    def _made(self, axis: int, length: float) -> Placed:
+        thick = 0.011 * self._extent
+        node = self._scene.add_arrows(
+            f"/basis/{axis}",
+            _along_x(length),
+            linear_rgb(COLOURS[axis % len(COLOURS)]),
+            shaft_radius=0.35 * thick,
+            head_radius=thick,
+            head_length=2.5 * thick,
+        )
+        return Placed(node)
+
+
+def _along_x(length: float) -> NDArray[np.float32]:
+    return np.array([[[0, 0, 0], [length, 0, 0]]], dtype=np.float32)
 
 
 def arrow_ways(basis: Basis, extent: float) -> Array:

@@ -43,26 +43,22 @@ class Controls:
             f'<iframe id="pad" title="pad" allow="gamepad" style="width:100%;height:{height}px;border:0" '
             f'srcdoc="{escape(PAD.read_text())}"></iframe>'
         )
-        self._choose = gui.add_dropdown(
+        self._choose: Any = gui.add_dropdown(
             "Interface", list(session.interfaces), initial_value=session.interface.name
         )
         self._on(self._choose, lambda now, value: now.choose(value))
         drivers = (PERSON,) if session.pilot is None else (PERSON, POLICY)
-        self._drive = gui.add_dropdown(
+        self._drive: Any = gui.add_dropdown(
             "Driver", drivers, initial_value=session.driver, hint="A hand on the pad takes over at any time."
         )
         self._on(self._drive, lambda now, value: now.drive(value))
         self._buttons("Episode", {"Next goal": lambda now: now.next_goal(), "Reset": lambda now: now.reset()})
-        self._speed = gui.add_slider(
+        speed = gui.add_slider(
             "Speed", min=0.1, max=max(2.0, session.speed), step=0.1, initial_value=session.speed
         )
-        self._on(self._speed, lambda now, value: setattr(now, "speed", float(value)))
+        self._on(speed, lambda now, value: setattr(now, "speed", float(value)))
         self._checkbox("Pause", False, lambda now, value: setattr(now, "paused", value))
         self._checkbox("Go on by itself", session.goes_on, lambda now, value: setattr(now, "goes_on", value))
-        with gui.add_folder("Basis"):
-            self.arrows = gui.add_checkbox("Arrows", True)
-            self.trail = gui.add_checkbox("Trail", True)
-            self._bars = gui.add_html("")
         with gui.add_folder("Record"):
             self._recording = gui.add_html("")
             self._record = gui.add_button("Record")
@@ -72,6 +68,10 @@ class Controls:
                 {"Save": lambda now: now.save(), "Discard last": lambda now: now.recorder.discard()},
             )
         self._message = gui.add_html("")
+        with gui.add_folder("Basis"):
+            self.arrows = gui.add_checkbox("Arrows", True)
+            self.trail = gui.add_checkbox("Trail", True)
+            self._bars = gui.add_html("")
 
     def _on(self, control: Any, change: Callable[[Session, Any], object]) -> None:
         @control.on_update
@@ -104,9 +104,10 @@ class Controls:
         label = "Stop" if now.recorder.on else "Record"
         if self._record.label != label:
             self._record.label = label
-        for control, value in ((self._choose, now.interface.name), (self._drive, now.driver)):
-            if control.value != value:
-                control.value = value
+        if self._choose.value != now.interface.name:
+            self._choose.value = now.interface.name
+        if self._drive.value != now.driver:
+            self._drive.value = now.driver
 
     def _write(self, place: Any, text: str) -> None:
         """HTML is sent only when it has changed."""

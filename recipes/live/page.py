@@ -102,7 +102,7 @@ class Page:
         if self._trail and np.linalg.norm(place - self._trail[-1]) < 1e-3:
             return
         self._trail.append(place)
-        if self._frames % 2 and self._trail_node is not None:
+        if self._frames % WRITE_EVERY and self._trail_node is not None:
             return
         points = np.array(self._trail, dtype=np.float32)
         if len(points) < 2 or not self._controls.trail.value:
@@ -110,7 +110,7 @@ class Page:
         segments = np.stack([points[:-1], points[1:]], axis=1)
         if self._trail_node is None:
             self._trail_node = self._server.scene.add_line_segments(
-                "/trail", segments, np.array(TRAIL_COLOUR, dtype=np.uint8), line_width=3.0
+                "/trail", segments, TRAIL_COLOUR, thickness=3.0, thickness_units="screen"
             )
         else:
             self._trail_node.points = segments

@@ -104,7 +104,7 @@ class Recorder:
             raise ValueError("nothing is recorded: press record, and move.")
         steps = [step for episode in self.episodes for step in episode]
         lengths = torch.tensor([len(episode) for episode in self.episodes])
-        data = torch.stack(steps)
+        data = TensorDict.stack(steps)
         data["episode"] = torch.arange(len(lengths)).repeat_interleave(lengths)
         return nht.Demos.from_episodes(data, env=self._env, expert="person", settings=self._settings)
 

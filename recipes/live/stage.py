@@ -116,8 +116,8 @@ def add_shape(scene: SceneApi, name: str, shape: Shape) -> Any:
     x, y, z = shape.size
     if shape.mesh is not None:
         vertices, faces = shape.mesh
-        side = "double" if shape.kind in (G.mjGEOM_PLANE, G.mjGEOM_HFIELD) else "front"
-        return scene.add_mesh_simple(name, vertices, faces, side=side, **look)
+        look["side"] = "double" if shape.kind in (G.mjGEOM_PLANE, G.mjGEOM_HFIELD) else "front"
+        return scene.add_mesh_simple(name, vertices, faces, **look)
     if shape.kind == G.mjGEOM_BOX:
         return scene.add_box(name, dimensions=(2 * x, 2 * y, 2 * z), **look)
     if shape.kind == G.mjGEOM_CYLINDER:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -101,13 +103,13 @@ def angle_to_jacobian(effects: Array, jacobian: Array) -> float:
     if not span.shape[1] or not rows.shape[1]:
         return 0.0
     outside = span - rows @ (rows.T @ span)
-    return float(np.arcsin(min(1.0, np.linalg.norm(outside, ord=2))))
+    return math.asin(min(1.0, float(np.linalg.norm(outside, ord=2))))
 
 
 def rises(velocity: Array) -> float:
     """The angle by which a motion ``(3,)`` leaves the horizontal plane [rad], downwards negative."""
-    length = np.linalg.norm(velocity)
-    return float(np.arcsin(velocity[2] / length)) if length > 1e-9 else 0.0
+    length = float(np.linalg.norm(velocity))
+    return math.asin(min(1.0, max(-1.0, float(velocity[2] / length)))) if length > 1e-9 else 0.0
 
 
 def _orthonormal(columns: Array) -> Array:

@@ -50,6 +50,7 @@ def open_page(browser, address, width=800, height=500):
 
 
 def pad_centre(page):
+    page.locator("#pad").scroll_into_view_if_needed()
     box = page.frame_locator("#pad").locator("#pad").bounding_box()
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
