@@ -11,23 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi
 
+from nht.envs.arrays import Array
 from nht.recipes.live.session import Session
-from nht.recipes.live.stage import Placed
+from nht.recipes.live.stage import PosedNode
 from nht.recipes.live.tool import Tool, angle_to_jacobian, rises
 
-Array = NDArray[np.float64]
-
-COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4FB5")
+AXIS_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4FB5")
 """Of the action axes, in order: Okabe and Ito's, which the colour-blind can tell apart, and one more."""
 AHEAD = 0.4
 """An arrow ends where the tool would be after so many seconds of an action of 1 on its axis alone."""
-LONGEST = 0.25
+LONGEST_ARROW = 0.25
 """Length of the longest arrow where actuations accelerate the tool, as a share of the model's extent."""
 NOTICED = 0.02
 """A smaller change of an arrow's length, as a share of it, is not sent."""
 X_TO_Z = np.array([math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0])
 """The quaternion that turns x to z."""
-SHORTEST = 0.004
+SHORTEST_ARROW = 0.004
 """A shorter arrow is left out, as a share of the model's extent."""
 
 
@@ -70,13 +69,13 @@ class Arrows:
 
     def __init__(self, scene: SceneApi, extent: float) -> None:
         self._scene, self._extent = scene, extent
-        self._axes: dict[int, tuple[Placed, float]] = {}
+        self._axes: dict[int, tuple[PosedNode, float]] = {}
 
     def update(self, basis: Basis | None, tool: Array) -> None:
         """Draw the arrows of a basis at ``tool`` [m], ``(3,)``; None draws none."""
         ways = np.zeros((0, 3)) if basis is None else arrow_ways(basis, self._extent)
         lengths = np.linalg.norm(ways, axis=1)
-        shown = {int(axis) for axis in np.flatnonzero(lengths > SHORTEST * self._extent)}
+        shown = {int(axis) for axis in np.flatnonzero(lengths > SHORTEST_ARROW * self._extent)}
         for axis in self._axes.keys() - shown:
             self._axes.pop(axis)[0].node.remove()
         for axis in sorted(shown):
@@ -95,17 +94,17 @@ class Arrows:
         mujoco.mju_mulQuat(full, turn, X_TO_Z)
         arrow.move(tool, full)
 
-    def _made(self, axis: int, length: float) -> Placed:
-        thick = 0.011 * self._extent
+    def _made(self, axis: int, length: float) -> PosedNode:
+        thick = 0.014 * self._extent
         node = self._scene.add_arrows(
             f"/basis/{axis}",
             _along_x(length),
-            linear_rgb(COLOURS[axis % len(COLOURS)]),
+            linear_rgb(AXIS_COLOURS[axis % len(AXIS_COLOURS)]),
             shaft_radius=0.35 * thick,
             head_radius=thick,
             head_length=2.5 * thick,
         )
-        return Placed(node)
+        return PosedNode(node)
 
 
 def _along_x(length: float) -> NDArray[np.float32]:
@@ -120,7 +119,7 @@ def arrow_ways(basis: Basis, extent: float) -> Array:
     if basis.moves_by == "velocity":
         return linear * AHEAD
     longest = np.linalg.norm(linear, axis=1).max(initial=0.0)
-    return linear * (LONGEST * extent / longest if longest > 1e-12 else 0.0)
+    return linear * (LONGEST_ARROW * extent / longest if longest > 1e-12 else 0.0)
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
@@ -130,8 +129,8 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 
 def linear_rgb(colour: str) -> tuple[int, int, int]:
-    """A colour as the viewer's arrows take it, in proportion to light: they are not corrected for the eye."""
-    red, green, blue = (round(255 * (part / 255) ** 2.2) for part in rgb(colour))
+    """A colour as the viewer's arrows take it: in proportion to light, and darker, as its lamps are bright."""
+    red, green, blue = (round(160 * (part / 255) ** 2.2) for part in rgb(colour))
     return red, green, blue
 
 
@@ -150,7 +149,7 @@ def bars_html(basis: Basis, motors: list[str], actuation: Array, bounds: tuple[A
     rows = []
     for name, parts, now, most in zip(motors, basis.effects, actuation, limit, strict=True):
         bars = [
-            _bar(part / largest, 2 + 4 * axis, COLOURS[axis % len(COLOURS)])
+            _bar(part / largest, 2 + 4 * axis, AXIS_COLOURS[axis % len(AXIS_COLOURS)])
             for axis, part in enumerate(parts)
         ]
         bars.append(_bar(float(now) / max(float(most), 1e-9), height - 3, "#888"))
@@ -174,7 +173,7 @@ def _told(basis: Basis) -> str:
     lines = []
     if basis.motion is not None:
         for axis, column in enumerate(basis.motion.T):
-            colour = COLOURS[axis % len(COLOURS)]
+            colour = AXIS_COLOURS[axis % len(AXIS_COLOURS)]
             lines.append(f'<b style="color:{colour}">axis {axis + 1}</b> {_motion(column, basis.moves_by)}')
     if basis.angle is not None:
         lines.append(f"angle to the Jacobian {math.degrees(basis.angle):.1f}°")

@@ -7,13 +7,10 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from viser import GuiApi
 
+from nht.envs.arrays import Array
 from nht.recipes.live.session import FAILED, PERSON, POLICY, RUNNING, SUCCESS, Session
-
-Array = NDArray[np.float64]
 
 PAD = Path(__file__).parent / "pad.html"
 OUTCOMES = {RUNNING: "#777", SUCCESS: "#1e963c", FAILED: "#c82828"}
@@ -38,7 +35,7 @@ class Controls:
         self._shown: dict[int, str] = {}
         self._values: list[float] = []
         self._status = gui.add_html("")
-        height = 222 if max(each.action_dim for each in session.interfaces.values()) <= 9 else 360
+        height = 210 if max(each.action_dim for each in session.interfaces.values()) <= 9 else 360
         gui.add_html(
             f'<iframe id="pad" title="pad" allow="gamepad" style="width:100%;height:{height}px;border:0" '
             f'srcdoc="{escape(PAD.read_text())}"></iframe>'

@@ -20,7 +20,7 @@ PAD_PATH = "/pad"
 LOCAL = "127.0.0.1"
 LONGEST_HEAD = 65_536
 """Bytes of a request's head, at most."""
-CHUNK = 65_536
+LED_ON = 65_536
 """Bytes that are led on at once."""
 
 Heard = Callable[[str, dict[str, Any]], object]
@@ -197,7 +197,7 @@ async def _sent(connection: ServerConnection, text: str) -> None:
 async def _pipe(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Lead everything from one end to the other until either closes."""
     with suppress(OSError, asyncio.CancelledError):
-        while chunk := await reader.read(CHUNK):
+        while chunk := await reader.read(LED_ON):
             writer.write(chunk)
             await writer.drain()
     with suppress(OSError, RuntimeError):

@@ -6,14 +6,12 @@ from typing import Any, Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
+from nht.envs.arrays import Array
 from nht.envs.foreign_copies import ForeignTask
 from nht.envs.gymnasium_copies import NativeCopy
 from nht.envs.task import BatchedTask
-
-Array = NDArray[np.float64]
 
 
 class Source(Protocol):

@@ -9,6 +9,8 @@ from nht.recipes.live.session import Session
 
 PICTURES = 50.0
 """Pictures per second, at most."""
+SOONER = 0.8
+"""A picture may follow a step so much sooner, as a share of the time between pictures: then each step has its own."""
 PAUSE = 1.5
 """Seconds for which an end, or the goal, stays to be seen before the next episode begins by itself."""
 BEHIND = 0.25
@@ -40,11 +42,12 @@ def keep_pace(session: Session, show: Callable[[], object], going: Callable[[], 
                 ended_at = None
         else:
             ended_at = None
-        if now >= due:
+        stepped = now >= due
+        if stepped:
             session.step()
             due = due + period if now - due < BEHIND else now + period
         now = clock()
-        if now - shown >= 1.0 / PICTURES:
+        if now - shown >= (SOONER if stepped else 1.0) / PICTURES:
             shown = now
             show()
         wait = min(due, shown + 1.0 / PICTURES) - clock()

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from viser import ViserServer
 
-from nht.recipes.live.basis import COLOURS, Arrows, Basis, bars_html, present_basis
+from nht.recipes.live.basis import AXIS_COLOURS, Arrows, Basis, bars_html, present_basis
 from nht.recipes.live.controls import Controls
 from nht.recipes.live.door import LOCAL, Door
 from nht.recipes.live.mirror import Mirror
@@ -120,7 +120,7 @@ class Page:
         if name != self._told_axes:
             self._told_axes = name
             axes = self._session.interface.action_dim
-            self._door.tell({"axes": axes, "colours": COLOURS, "action": [0.0] * axes})
+            self._door.tell({"axes": axes, "colours": AXIS_COLOURS, "action": [0.0] * axes})
         now = self._session
         by_policy = now.driving == POLICY and now.action.shape[-1] == now.interface.action_dim
         key = "driven" if by_policy else "action"

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from nht.envs.arrays import Array
+
 Colour = tuple[int, int, int]
 
 ROUND = 32
@@ -18,7 +19,7 @@ INFINITE = 20.0
 """Half of the side of a plane without end [m]."""
 SHOWN_GROUPS = 3
 """Geoms of the first groups are shown, as MuJoCo's own viewer does; the others are for collisions."""
-GREY = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+COLOURLESS = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 """MuJoCo's colour of a geom that has none."""
 G = mujoco.mjtGeom
 
@@ -127,7 +128,7 @@ def _grid_faces(rows: int, columns: int, *, closed: bool = False) -> NDArray[np.
 
 def _colour(model: mujoco.MjModel, geom: int) -> NDArray[np.float32]:
     own, material = model.geom_rgba[geom], int(model.geom_matid[geom])
-    if material >= 0 and np.array_equal(own, GREY):
+    if material >= 0 and np.array_equal(own, COLOURLESS):
         return np.array(model.mat_rgba[material])
     return np.array(own)
 

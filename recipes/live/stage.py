@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from viser import SceneApi
 
+from nht.envs.arrays import Array
 from nht.recipes.live.mirror import Mirror
 from nht.recipes.live.shapes import G, Shape, shape_of_geom, shape_of_mark
-
-Array = NDArray[np.float64]
 
 STILL = 1e-6
 """A smaller change of a position [m] or quaternion is not sent."""
@@ -30,13 +29,13 @@ class Stage:
 
     def __init__(self, scene: SceneApi, mirror: Mirror) -> None:
         self._scene, self._mirror = scene, mirror
-        self._marks: list[tuple[Shape, Placed]] = []
+        self._marks: list[tuple[Shape, PosedNode]] = []
         self._build()
 
     def _build(self) -> None:
         model = self._mirror.model
         self._bodies = {
-            body: Placed(self._scene.add_frame(f"/robot/{body}", show_axes=False))
+            body: PosedNode(self._scene.add_frame(f"/robot/{body}", show_axes=False))
             for body in sorted(set(map(int, model.geom_bodyid)))
         }
         for geom in range(model.ngeom):
@@ -44,7 +43,7 @@ class Stage:
             if shape is not None:
                 name = f"/robot/{int(model.geom_bodyid[geom])}/{geom}"
                 node = add_shape(self._scene, name, shape)
-                Placed(node).move(model.geom_pos[geom], model.geom_quat[geom])
+                PosedNode(node).move(model.geom_pos[geom], model.geom_quat[geom])
         self._looks = self._model_looks()
         self.update()
 
@@ -75,14 +74,14 @@ class Stage:
             for _, placed in self._marks:
                 placed.node.remove()
             self._marks = [
-                (shape, Placed(add_shape(self._scene, f"/marks/{number}", shape)))
+                (shape, PosedNode(add_shape(self._scene, f"/marks/{number}", shape)))
                 for number, (shape, _, _) in enumerate(found)
             ]
         for (_, placed), (_, position, turn) in zip(self._marks, found, strict=True):
             placed.move(position, turn)
 
 
-class Placed:
+class PosedNode:
     """A node of the scene, which is sent again only when it has moved."""
 
     def __init__(self, node: Any) -> None:

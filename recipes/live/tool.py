@@ -6,11 +6,9 @@ import math
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from nht.envs.arrays import Array
 from nht.recipes.live.mirror import Mirror
-
-Array = NDArray[np.float64]
 
 SITES = ("tool", "grasp", "grip", "pinch", "end_effector", "ee", "tip")
 """Words in the names of sites that are taken for the tool, the first one first."""
