@@ -10,23 +10,14 @@ from __future__ import annotations
 from nht.recipes.config import Steer
 from nht.recipes.launch import launch
 from nht.recipes.live.opening import open_page
+from nht.recipes.live.pace import keep_pace, until_told_to_end
 
 
 def main(config: Steer) -> None:
-    """Open the page, and keep the task running until Ctrl-C."""
-    from nht.recipes.live.pace import keep_pace
-
-    session, page, door = open_page(config)
-    try:
-        print(f"steer at {door.address}, as many as want to; Ctrl-C ends.", flush=True)
+    """Open the page, and keep the task running until Ctrl-C or SIGTERM."""
+    with until_told_to_end(), open_page(config) as (session, page):
+        print(f"steer at {page.address}, as many as want to; Ctrl-C ends.", flush=True)
         keep_pace(session, page.show)
-    except KeyboardInterrupt:
-        print()
-    finally:
-        page.close()
-        session.close()
-        if session.message.startswith("saved in"):
-            print(session.message)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -51,34 +50,30 @@ class Counts:
         self.shown = self.messages = self.drawn = 0
 
 
-@contextmanager
-def steering(counts: Counts, drive: Callable[[str, Counts], None]) -> Iterator[None]:
-    """A page that runs until ``drive``, in a thread of its own, has ended."""
+def steer(counts: Counts, drive: Callable[[str, Counts], None]) -> None:
+    """Run a page until ``drive``, in a thread of its own, has ended."""
     map = nht.NHT(context_dim=10, actuation_dim=7, action_dim=2)
     map.context_keys = ("tool_position", "joint_angle")
     with tempfile.TemporaryDirectory() as folder:
         nht.save_map(map, f"{folder}/nht.safetensors")
         words = [f"map.file={folder}/nht.safetensors", "port=0", f"out={folder}/none"]
-        session, page, door = open_page(configure(Steer, "steer", words))
-        tell = session.commands.on_reached
+        with open_page(configure(Steer, "steer", words)) as (session, page):
+            tell = session.commands.on_reached
 
-        def reached(pad: object, stamp: float) -> None:
-            if counts.on and stamp:
-                counts.late.append(1e3 * time.time() - stamp)
-            if tell is not None:
-                tell(pad, stamp)
+            def reached(pad: object, stamp: float) -> None:
+                if counts.on and stamp:
+                    counts.late.append(1e3 * time.time() - stamp)
+                if tell is not None:
+                    tell(pad, stamp)
 
-        def show() -> None:
-            page.show()
-            counts.shown += counts.on
+            def show() -> None:
+                page.show()
+                counts.shown += counts.on
 
-        session.commands.on_reached = reached
-        hand = threading.Thread(target=drive, args=(door.address, counts))
-        hand.start()
-        keep_pace(session, show, hand.is_alive)
-        page.close()
-        session.close()
-    yield
+            session.commands.on_reached = reached
+            hand = threading.Thread(target=drive, args=(page.address, counts))
+            hand.start()
+            keep_pace(session, show, hand.is_alive)
 
 
 def by_socket(address: str, counts: Counts) -> None:
@@ -159,8 +154,8 @@ def main() -> None:
         ways["mouse in headless Chromium"] = by_mouse
     for name, drive in ways.items():
         counts = Counts()
-        with steering(counts, drive):
-            rows.append(row(name, counts))
+        steer(counts, drive)
+        rows.append(row(name, counts))
         print(rows[-1], flush=True)
     with open(HERE / "results" / "steering" / "steering.csv", "w", newline="") as file:
         table = csv.DictWriter(file, rows[0])

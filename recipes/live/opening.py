@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,14 +24,14 @@ from nht.recipes.sections import EnvConfig, Training
 
 if TYPE_CHECKING:
     from nht.recipes.config import Steer
-    from nht.recipes.live.door import Door
     from nht.recipes.live.page import Page
 
 SHIPPED = ("viser", "websockets")
 
 
-def open_page(config: Steer) -> tuple[Session, Page, Door]:
-    """The session, its page, and the door that browsers come through.
+@contextmanager
+def open_page(config: Steer) -> Iterator[tuple[Session, Page]]:
+    """A session and its page, which are closed at the end; what was recorded and not saved is saved then.
 
     Raises:
         ImportError: without the extra.
@@ -41,13 +42,10 @@ def open_page(config: Steer) -> tuple[Session, Page, Door]:
     from nht.recipes.live.door import Door
     from nht.recipes.live.page import Page
 
-    with ExitStack() as undo:
-        door = undo.enter_context(Door(config.host, config.port))
+    with Door(config.host, config.port) as door:
         opened = open_session(config)
-        undo.callback(opened.session.close)
-        page = Page(*opened, door)
-        undo.pop_all()
-    return opened.session, page, door
+        with closing(opened.session), closing(Page(*opened, door)) as page:
+            yield opened.session, page
 
 
 def check_extra() -> None:

@@ -1,9 +1,12 @@
-"""Real time: when the next step is due, and when the next picture is."""
+"""Real time: when the next step is due, when the next picture is, and when all ends."""
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from nht.recipes.live.session import Session
 
@@ -53,3 +56,17 @@ def keep_pace(session: Session, show: Callable[[], object], going: Callable[[], 
         wait = min(due, shown + 1.0 / PICTURES) - clock()
         if wait > 0:
             time.sleep(min(wait, 1.0 / PICTURES))
+
+
+@contextmanager
+def until_told_to_end() -> Iterator[None]:
+    """Within, Ctrl-C and SIGTERM end what goes on, without a traceback; all that is open is closed in order."""
+    known = threading.current_thread() is threading.main_thread()  # elsewhere Python knows no signals
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler) if known else None
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if known:
+            signal.signal(signal.SIGTERM, before)

@@ -64,6 +64,11 @@ class Page:
         self._tell_pads()
         door.open(self._server.get_port(), self._heard)
 
+    @property
+    def address(self) -> str:
+        """Where a browser finds it."""
+        return self._door.address
+
     def _heard(self, pad: str, said: dict[str, Any]) -> None:
         """What a pad says, in the door's thread."""
         action, stamp = said.get("action"), said.get("stamp", 0.0)

@@ -209,5 +209,6 @@ class Session:
         self.recorder.end_episode()
         if self.recorder.episodes:
             self.save()
+            print(self.message)
         if not self._base.is_closed:
             self._base.close()

@@ -165,7 +165,7 @@ def test_every_option_is_read(reads, tmp_path, monkeypatch):
     run(compare_maps, schemas.CompareMaps, "compare_maps", *compared)
     run(export_map, schemas.ExportMap, "export_map", "file=map.safetensors", "out=map.pt2")
     run(report, schemas.Report, "report", "folder=runs")
-    monkeypatch.setattr("nht.recipes.live.pace.keep_pace", lambda *_: None)
+    monkeypatch.setattr("nht.recipes.steer.keep_pace", lambda *_: None)
     run(steer, schemas.Steer, "steer", "run=runs/ddpg", "maps=[map.safetensors]", "port=0")
     monkeypatch.setattr("nht.recipes.study.cluster.Cluster", InProcess)
     monkeypatch.setattr(Algorithm, "train", lambda *_: None)

@@ -20,7 +20,7 @@ def told(tmp_path, monkeypatch):
     """Runs the recipe in an empty folder, in which no map can be trained; gives the error."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(nht, "train_map", lambda *_, **__: pytest.fail("a map was trained"))
-    monkeypatch.setattr("nht.recipes.live.pace.keep_pace", lambda *_: pytest.fail("the page was opened"))
+    monkeypatch.setattr("nht.recipes.steer.keep_pace", lambda *_: pytest.fail("the page was opened"))
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["steer", "port=0", *words])
