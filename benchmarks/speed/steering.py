@@ -66,8 +66,8 @@ def steer(counts: Counts, drive: Callable[[str, Counts], None]) -> None:
                 if tell is not None:
                     tell(pad, stamp)
 
-            def show() -> None:
-                page.show()
+            def show(part: float) -> None:
+                page.show(part)
                 counts.shown += counts.on
 
             session.commands.on_reached = reached

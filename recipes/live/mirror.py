@@ -102,11 +102,30 @@ class Mirror:
         self.model = source.model
         self.data = mujoco.MjData(self.model)
         self._scene = mujoco.MjvScene(self.model, maxgeom=200)
-        self.look()
+        self._before = self._latest = np.array(self.data.qpos)
+        self.jump()
 
-    def look(self) -> None:
-        """Copy the state as it stands now."""
+    def jump(self) -> None:
+        """Copy the state as it stands now, after a jump in time: there is no way from the one before."""
         self._source.copy_into(self.data)
+        self._before = self._latest = np.array(self.data.qpos)
+        mujoco.mj_forward(self.model, self.data)
+
+    def look(self, part: float = 1.0) -> None:
+        """Copy the state as it stands now, or a pose on the way to it.
+
+        Args:
+            part: of the way from the state before the last step, in 0 .. 1; so slow steps look smooth.
+        """
+        self._source.copy_into(self.data)
+        if not np.array_equal(self.data.qpos, self._latest):
+            self._before, self._latest = self._latest, np.array(self.data.qpos)
+        if part < 1.0:
+            way = np.zeros(self.model.nv)
+            mujoco.mj_differentiatePos(self.model, way, 1.0, self._before, self._latest)
+            pose = self._before.copy()
+            mujoco.mj_integratePos(self.model, pose, way, part)
+            self.data.qpos[:] = pose
         mujoco.mj_forward(self.model, self.data)
 
     def moving_parts(self) -> tuple[Array, float]:

@@ -12,6 +12,8 @@ from nht.recipes.live.session import Session
 
 PICTURES = 50.0
 """Pictures per second, at most."""
+SLOW = 1 / 30
+"""Steps that are farther apart [s] are shown on their way."""
 SOONER = 0.8
 """A picture may follow a step so much sooner, as a share of the time between pictures: then each step has its own."""
 PAUSE = 1.5
@@ -20,19 +22,22 @@ BEHIND = 0.25
 """Seconds by which steps may be late before the clock gives up on catching up."""
 
 
-def keep_pace(session: Session, show: Callable[[], object], going: Callable[[], bool] = lambda: True) -> None:
+def keep_pace(
+    session: Session, show: Callable[[float], object], going: Callable[[], bool] = lambda: True
+) -> None:
     """Step a session in real time, times its speed, and show it, until ``going`` says no.
 
-    Steps are made when they are due, one for each picture or several; a picture follows the step. While nothing moves,
+    Steps are made when they are due, one for each picture or several; a picture follows the step. Where steps are far
+    apart, in slow motion or by the task's own clock, pictures show the way from one to the next. While nothing moves,
     pictures go on, so that what people press shows at once.
 
     Args:
         session: what is stepped.
-        show: draws it.
+        show: draws it; told which part of the last step's way is to be seen.
         going: asked before every turn.
     """
     clock = time.monotonic
-    due = shown = clock()
+    due = shown = stepped_at = clock()
     ended_at: float | None = None
     while going():
         session.settle()
@@ -48,11 +53,12 @@ def keep_pace(session: Session, show: Callable[[], object], going: Callable[[], 
         stepped = now >= due
         if stepped:
             session.step()
+            stepped_at = clock()
             due = due + period if now - due < BEHIND else now + period
         now = clock()
         if now - shown >= (SOONER if stepped else 1.0) / PICTURES:
             shown = now
-            show()
+            show(min(1.0, (now - stepped_at) / period) if period > SLOW else 1.0)
         wait = min(due, shown + 1.0 / PICTURES) - clock()
         if wait > 0:
             time.sleep(min(wait, 1.0 / PICTURES))

@@ -77,15 +77,20 @@ class Page:
         elif isinstance(action, list) and all(isinstance(each, int | float) for each in action):
             self._session.commands.ask(action, pad, float(stamp) if isinstance(stamp, int | float) else 0.0)
 
-    def show(self) -> None:
-        """Send what has changed since the last time, to everybody."""
+    def show(self, part: float = 1.0) -> None:
+        """Send what has changed since the last time, to everybody.
+
+        Args:
+            part: of the last step's way that is to be seen, in 0 .. 1.
+        """
         now = self._session
-        self._mirror.look()
         self._frames += 1
         if now.episode != self._episode:
             self._episode = now.episode
+            self._mirror.jump()
             self._trail.clear()
             self._stage.renew()
+        self._mirror.look(part)
         basis = present_basis(now, self._tool)
         place = self._tool.position
         with self._server.atomic():

@@ -244,7 +244,7 @@ def test_time_passes_at_the_speed_that_was_asked_for(two, monkeypatch, speed, ex
     clock = Clock()
     monkeypatch.setattr("nht.recipes.live.pace.time", clock)
     two.speed, two.goes_on, shown = speed, False, []
-    keep_pace(two, lambda: shown.append(two.steps), lambda: clock.now < 51.0)
+    keep_pace(two, lambda _: shown.append(two.steps), lambda: clock.now < 51.0)
     assert abs(two.steps - expected) <= 1
     assert 45 <= len(shown) <= 51
 
@@ -253,9 +253,21 @@ def test_the_next_episode_begins_by_itself_if_wanted(tmp_path, monkeypatch):
     clock = Clock()
     monkeypatch.setattr("nht.recipes.live.pace.time", clock)
     opened = session(f"map.file={map_file(tmp_path)}", "max_episode_steps=10")
-    keep_pace(opened, lambda: None, lambda: clock.now < 52.0)
+    keep_pace(opened, lambda _: None, lambda: clock.now < 52.0)
     assert opened.episode == 2
     opened.goes_on = False
-    keep_pace(opened, lambda: None, lambda: clock.now < 60.0)
+    keep_pace(opened, lambda _: None, lambda: clock.now < 60.0)
     assert opened.episode == 2
     opened.close()
+
+
+def test_slow_steps_are_shown_on_their_way(two, monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("nht.recipes.live.pace.time", clock)
+    shown = {0.2: [], 1.0: []}
+    for speed, parts in shown.items():
+        two.speed = speed
+        keep_pace(two, parts.append, lambda end=clock.now + 1.0: clock.now < end)
+    assert set(shown[1.0][1:]) == {1.0}
+    assert max(shown[0.2]) <= 1.0
+    assert len({round(part, 1) for part in shown[0.2]}) >= 4

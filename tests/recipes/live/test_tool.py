@@ -32,6 +32,23 @@ def test_the_tool_is_where_the_task_says(opened):
     assert np.allclose(tool.position, session.observed["tool_position"][0], atol=1e-6)
 
 
+def test_on_the_way_of_a_step_the_pose_is_between_its_ends(opened):
+    session, mirror, _ = opened
+    ends = [np.array(mirror.data.qpos)]
+    moves(session, [0.5, 0.5, 0.2, 0, 0, 0.1], 1)
+    for part in (0.0, 0.25, 1.0):
+        mirror.look(part)
+        ends.append(np.array(mirror.data.qpos))
+    start, first, quarter, last = ends
+    assert np.allclose(first, start)
+    assert np.allclose(last, session.observed["joint_angle"][0], atol=1e-6)
+    assert np.allclose(quarter, start + 0.25 * (last - start))
+    session.next_goal()
+    mirror.jump()
+    mirror.look(0.0)
+    assert np.allclose(mirror.data.qpos, session.observed["joint_angle"][0], atol=1e-6)
+
+
 def test_its_jacobian_is_that_of_the_arm(opened):
     session, mirror, tool = opened
     moves(session, [0.5, 0.5, 0.2, 0, 0, 0.1], 10)
