@@ -95,12 +95,12 @@ class Arrows:
         arrow.move(tool, full)
 
     def _made(self, axis: int, length: float) -> PosedNode:
-        thick = 0.014 * self._extent
+        thick = 0.018 * self._extent
         node = self._scene.add_arrows(
             f"/basis/{axis}",
             _along_x(length),
             linear_rgb(AXIS_COLOURS[axis % len(AXIS_COLOURS)]),
-            shaft_radius=0.35 * thick,
+            shaft_radius=0.45 * thick,
             head_radius=thick,
             head_length=2.5 * thick,
         )

@@ -104,8 +104,9 @@ def map_in_file(path: str, settings: MapConfig, allow: list[str]) -> nht.ActionM
         ValueError: if it holds no map.
     """
     if not Path(path).is_file():
+        known = "" if Path(path).suffix else f", nor a kind of that name among {sorted(KINDS)}"
         raise FileNotFoundError(
-            f"there is no map {path}: train one, python -m nht.recipes.train_map map=nht out={path}."
+            f"there is no map {path}{known}: train one, python -m nht.recipes.train_map map=nht out={path}."
         )
     map = nht.load_map(path, allow=[*settings.allow, *allow])
     if settings.saturation is not None:

@@ -51,7 +51,7 @@ def test_a_port_in_use_comes_before_everything_else(told, monkeypatch):
         ),
         (["run=nowhere"], "nowhere holds no run"),
         (["maps=[scl,nht]"], "['scl', 'nht'] are trained on demonstrations: name them, demos.path=FOLDER"),
-        (["maps=[pca]"], "no map pca: train one"),
+        (["maps=[pca]"], "no map pca, nor a kind of that name among ['cae', 'jacobian', "),
         (["tool=hand"], "the model has no part 'hand': its sites are ['tool']"),
         (["env.name=moon"], "unknown environment 'moon'"),
         (["env=gymnasium", "env.name=Pendulum-v1"], "Pendulum-v1 has no MuJoCo model to draw"),
