@@ -3,7 +3,7 @@
     OMP_NUM_THREADS=1 python benchmarks/speed/steering.py
 
 Steers WAMWipe through an untrained NHT (10 numbers of context, two layers of 256) at real time. Without a browser, a
-pad of ours sends a new action every 37 ms. With Chromium, the mouse drags the page's own pad: headless it draws in
+pad of ours sends a new action every 37 ms, and a viewer takes what comes and draws nothing. With Chromium, the mouse drags the page's own pad: headless it draws in
 software on the same cores, which a graphics card would do, and therefore runs at a lower priority. Both measure from
 the clock of the pad before a command leaves until the step that executes it begins; it is the same clock, as all runs
 on one machine. Updates are pictures that were sent, messages of them that arrived, and those that Chromium drew.
@@ -23,10 +23,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import torch
-from websockets.sync.client import connect
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 import nht
 from nht.recipes.config import Steer
@@ -77,15 +81,25 @@ def steer(counts: Counts, drive: Callable[[str, Counts], None]) -> None:
 
 
 def by_socket(address: str, counts: Counts) -> None:
-    """A pad without a page."""
-    with connect(f"{address.replace('http', 'ws')}/pad") as pad:
-        start = time.monotonic()
-        while (passed := time.monotonic() - start) < WARM_UP + SECONDS:
-            counts.on = passed > WARM_UP
-            action = [0.1 * (int(passed * 2) % 3 - 1), 0.1 * ((passed * 7) % 1.0)]
-            pad.send(json.dumps({"action": action, "stamp": 1e3 * time.time()}))
-            time.sleep(PAUSE)
-        counts.on = False
+    """A pad without a page, and a viewer that takes all messages and draws nothing."""
+    socket = address.replace("http", "ws")
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    with connect(socket, subprotocols=[protocol], max_size=None, compression=None) as viewer:
+        threading.Thread(target=count_messages, args=(viewer, counts), daemon=True).start()
+        with connect(f"{socket}/pad") as pad:
+            start = time.monotonic()
+            while (passed := time.monotonic() - start) < WARM_UP + SECONDS:
+                counts.on = passed > WARM_UP
+                action = [0.1 * (int(passed * 2) % 3 - 1), 0.1 * ((passed * 7) % 1.0)]
+                pad.send(json.dumps({"action": action, "stamp": 1e3 * time.time()}))
+                time.sleep(PAUSE)
+            counts.on = False
+
+
+def count_messages(viewer: ClientConnection, counts: Counts) -> None:
+    with suppress(ConnectionClosed):
+        for _ in viewer:
+            counts.messages += counts.on
 
 
 def by_mouse(address: str, counts: Counts) -> None:
@@ -149,7 +163,7 @@ def row(name: str, counts: Counts) -> dict[str, object]:
 def main() -> None:
     torch.set_num_threads(1)
     rows = []
-    ways = {"a pad, no browser": by_socket}
+    ways = {"a pad and a viewer that draws nothing": by_socket}
     if shutil.which("chromium"):
         ways["mouse in headless Chromium"] = by_mouse
     for name, drive in ways.items():

@@ -27,7 +27,9 @@ LIGHT = 0.35
 """Of the surroundings, beside the viewer's own lamps."""
 AWAY = 1.3
 """How much farther than the model's camera people stand: the panel takes a part of the picture."""
-WRITE_EVERY = 5
+BASIS_EVERY = 2
+"""Frames between two computations of the basis, which cost as much as all else; arrows follow the tool in each."""
+WRITE_EVERY = 4
 """Frames between two changes of what is written."""
 
 
@@ -58,6 +60,7 @@ class Page:
         self._trail_node: Any = None
         self._motors = motor_names(mirror.model, session.base.action_spec.shape[-1])
         self._frames, self._episode, self._told_axes = 0, session.episode, ""
+        self._basis: Basis | None = None
         self._told_action: tuple[str, list[float]] = ("", [])
         self._look_through_camera()
         session.commands.on_reached = lambda pad, stamp: door.tell({"reached": stamp}, str(pad))
@@ -91,7 +94,9 @@ class Page:
             self._trail.clear()
             self._stage.renew()
         self._mirror.look(part)
-        basis = present_basis(now, self._tool)
+        if self._basis is None or self._frames % BASIS_EVERY == 0:
+            self._basis = present_basis(now, self._tool)
+        basis = self._basis
         place = self._tool.position
         with self._server.atomic():
             self._stage.update()
