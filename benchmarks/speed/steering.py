@@ -3,11 +3,12 @@
     OMP_NUM_THREADS=1 python benchmarks/speed/steering.py
 
 Steers WAMWipe through an untrained NHT (10 numbers of context, two layers of 256) at real time. Without a browser, a
-pad of ours sends a new action every 37 ms, and a viewer takes what comes and draws nothing. With Chromium, the mouse drags the page's own pad: headless it draws in
-software on the same cores, which a graphics card would do, and therefore runs at a lower priority. Both measure from
-the clock of the pad before a command leaves until the step that executes it begins; it is the same clock, as all runs
-on one machine. Updates are pictures that were sent, messages of them that arrived, and those that Chromium drew.
-Writes ``results/steering/steering.csv``. Takes a minute, and Debian's ``chromium`` with ``pip install playwright``.
+pad of ours sends a new action every 37 ms, and a viewer takes what comes and draws nothing. With Chromium, the mouse
+drags the page's own pad: headless it draws in software on the same cores, which a graphics card would do, and therefore
+runs at the lowest priority. Both measure from the clock of the pad before a command leaves until the step that executes
+it begins; it is the same clock, as all runs on one machine. Updates are pictures that were sent, messages of them that
+arrived, and those that Chromium drew. Writes ``results/steering/steering.csv``. Takes a minute, and Debian's
+``chromium`` with ``pip install playwright``.
 """
 
 from __future__ import annotations
@@ -111,10 +112,10 @@ def by_mouse(address: str, counts: Counts) -> None:
 
     with sync_playwright() as playwright, tempfile.TemporaryDirectory() as folder:
         polite = Path(folder) / "chromium"
-        polite.write_text(f'#!/bin/sh\nexec nice -n 10 {shutil.which("chromium")} "$@"\n')
+        polite.write_text(f'#!/bin/sh\nexec nice -n 19 {shutil.which("chromium")} "$@"\n')
         polite.chmod(0o755)
         browser = playwright.chromium.launch(executable_path=polite, args=FLAGS)
-        page = browser.new_page(viewport={"width": 800, "height": 500})
+        page = browser.new_page(viewport={"width": 640, "height": 400})
         page.on(
             "websocket", lambda opened: opened.url.endswith("/pad") or opened.on("framereceived", arrived)
         )

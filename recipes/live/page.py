@@ -48,9 +48,8 @@ class Page:
         with redirect_stdout(StringIO()):  # it prints an address that is not for people
             self._server = ViserServer(host=LOCAL, port=0, label="nht steer", verbose=False)
         scene = self._server.scene
-        self._server.gui.configure_theme(
-            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
-        )
+        self._server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self._server.gui.main_panel.dock_right()
         scene.world_axes.visible = False
         scene.configure_environment_map("studio", environment_intensity=LIGHT)
         self._stage = Stage(scene, mirror)
