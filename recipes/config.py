@@ -34,6 +34,7 @@ __all__ = [
     "Report",
     "RunConfig",
     "Search",
+    "Steer",
     "TrainMap",
     "Training",
     "Workspace",
@@ -202,3 +203,31 @@ class ExportMap:
     high: list[float] | None = None  # of each motor; None is no limit
     compiled: bool = False  # .pt2 only: machine code, for C++
     allow: list[str] = field(default_factory=list)  # packages whose classes the file may name
+
+
+@dataclass
+class Steer:
+    """``python -m nht.recipes.steer``."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    map: MapConfig = field(default_factory=MapConfig)  # file: the first interface; the rest: of those trained
+    # further interfaces: files of maps, or kinds that are trained on demos.path
+    maps: list[str] = field(default_factory=list, metadata={"path": True})
+    run: str | None = path_field(None)  # a finished run: its task, map, policy, and critic
+    tool: str | None = None  # site, body or geom that is drawn as the tool; null looks for one
+    max_episode_steps: int | None = 3_000  # of a task that lets it be set; null is what the task says
+    speed: float = 1.0  # as a multiple of real time
+    seed: int = 0  # of goals and starts
+    out: str = path_field("")  # folder of what is recorded; a number is added if it exists
+    minari: str | None = None  # id of a Minari dataset that it is saved as, too: wam/by-hand-v0
+    host: str = "127.0.0.1"  # who may look: this machine; 0.0.0.0 is everybody who can reach it
+    port: int = 8080  # of the page; 0 takes one that is free
+    allow: list[str] = field(default_factory=list)  # packages whose code run and maps may name
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a speed or a number of steps that is none."""
+        if not 0 < self.speed <= 10:
+            raise ValueError(f"speed must lie in (0, 10], got {self.speed}.")
+        if self.max_episode_steps is not None and self.max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {self.max_episode_steps}.")

@@ -16,6 +16,7 @@ from nht.recipes.config import (
     InspectDemos,
     Report,
     Search,
+    Steer,
     TrainMap,
 )
 from nht.recipes.help import as_typed, help_text, meanings
@@ -30,6 +31,7 @@ SCHEMAS = [
     InspectDemos,
     Report,
     Search,
+    Steer,
     TrainMap,
     *(ALGORITHMS[name].schema for name in ("ddpg", "td3", "sac", "ppo")),
 ]

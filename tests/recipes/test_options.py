@@ -20,6 +20,7 @@ from nht.recipes import (
     inspect_demos,
     report,
     search,
+    steer,
     train_map,
     workspace,
 )
@@ -170,6 +171,8 @@ def test_every_option_is_read(reads, tmp_path, monkeypatch):
         workspace, "import_module", lambda _: MagicMock()
     )  # an extra, whose views need a server
     run(workspace, schemas.Workspace, "workspace", "entity=somebody")
+    monkeypatch.setattr("nht.recipes.steer.keep_pace", lambda *_: None)
+    run(steer, schemas.Steer, "steer", "run=runs/ddpg", "maps=[map.safetensors]", "port=0")
     monkeypatch.setattr("nht.recipes.study.cluster.Cluster", InProcess)
     monkeypatch.setattr(Algorithm, "train", lambda *_: None)
     told = ["search=smoke", "search.best_seeds=0", "demos.path=demos", "folder=search"]

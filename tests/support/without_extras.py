@@ -20,6 +20,7 @@ EXTRAS = {
     "ray",
     "scipy",
     "tqdm",
+    "viser",
     "wandb",
     "yaml",
 }
