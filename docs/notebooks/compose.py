@@ -1,0 +1,4 @@
+# %% [markdown]
+# # compose
+# %%
+print(1)

@@ -1,0 +1,4 @@
+# %% [markdown]
+# # idea
+# %%
+print(1)

@@ -1,0 +1,4 @@
+# %% [markdown]
+# # interfaces
+# %%
+print(1)

@@ -1,0 +1,4 @@
+# %% [markdown]
+# # search
+# %%
+print(1)
