@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas
 from jinja2 import Environment, StrictUndefined
 from mkdocs.config.defaults import MkDocsConfig
@@ -20,6 +21,7 @@ from mkdocs.structure.pages import Page
 from pandas import DataFrame, Series
 
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
+FIELD = re.compile(r"\{([^{}:]+):?([^{}]*)\}")
 Rows = str | DataFrame
 
 
@@ -68,7 +70,7 @@ def summary(file: Rows, by: Mapping[str, str], cells: Mapping[str, tuple[str, st
         line = [as_text(value) for value in group]
         for column, where, show in cells.values():
             taken = part.query(where) if where else part
-            line.append(shown(show, _figures(taken[column], len(part))) if len(taken) else "")
+            line.append(shown(show, _figures(taken[column], len(part))))
         lines.append(line)
     return markdown_table([*by.values(), *cells], lines)
 
@@ -90,7 +92,7 @@ def grid(
     lines = []
     for group, part in _groups(found, list(by), order):
         cells = [part[part[across] == column][value].dropna() for column in columns]
-        figures = [shown(show, _figures(cell, len(cell))) if len(cell) else "" for cell in cells]
+        figures = [shown(show, _figures(cell, len(cell))) for cell in cells]
         lines.append([as_text(entry) for entry in group] + figures)
     return markdown_table([*by.values(), *(heading.format(column) for column in columns)], lines)
 
@@ -135,17 +137,26 @@ def markdown_table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> s
 
 
 def shown(show: str, values: Mapping[str, Any]) -> str:
-    """Values in a format; nothing where one is missing."""
-    if any(values.get(name) is None or values[name] != values[name] for name in re.findall(r"{([^}:]+)", show)):
+    """Values in a format, ``{name}`` or ``{name:.2f}``, whatever characters a name has; nothing where one is missing."""
+    if any(values[name] is None or values[name] != values[name] for name, _ in FIELD.findall(show)):
         return ""
-    return show.format_map({str(name): value for name, value in values.items()})
+    return FIELD.sub(lambda found: format(values[found.group(1)], found.group(2)), show)
 
 
 def as_text(value: Any) -> str:
-    """A value of a group: whole numbers with separators, others short; nothing for a missing one."""
-    if isinstance(value, float):
-        return "" if value != value else f"{value:,.0f}" if value == round(value) and value >= 10 else f"{value:.4g}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+    """A value of a group: whole numbers with separators, others short, yes for true; nothing for false or missing."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else ""
+    if isinstance(value, float) and (value != value or value != round(value) or abs(value) < 10):
+        return "" if value != value else f"{value:.4g}"
+    return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+class _Values(list[float]):
+    """Several numbers, each in the same format."""
+
+    def __format__(self, spec: str) -> str:
+        return ", ".join(format(value, spec) for value in self)
 
 
 def _groups(found: DataFrame, by: list[str], order: Sequence[str]) -> list[tuple[tuple[Any, ...], DataFrame]]:
@@ -163,8 +174,8 @@ def _figures(values: Series, whole: int) -> dict[str, Any]:
         "median": numbers.median(),
         "min": numbers.min(),
         "max": numbers.max(),
-        "sum": numbers.sum(),
-        "all": ", ".join(as_text(float(value)) for value in numbers),
+        "sum": numbers.sum() if len(values) else None,
+        "all": _Values(numbers) if len(values) else None,
         "first": values.iloc[0] if len(values) else None,
         "last": values.iloc[-1] if len(values) else None,
     }
