@@ -17,7 +17,7 @@ from torchrl.objectives import DDPGLoss, SoftUpdate
 import nht
 from nht.transforms import ActionMapTransform
 
-torch.manual_seed(0)
+_ = torch.manual_seed(0)
 
 # %% [markdown]
 # ## Demonstrations, and a map

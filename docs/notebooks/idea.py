@@ -85,7 +85,7 @@ import nht
 
 demos = nht.Demos.from_tensors(context={"joint_angle": contexts}, actuation=actuations, episode=episodes)
 map = nht.NHT(context_dim=3, actuation_dim=3, action_dim=1, hidden=(64,))
-metrics = nht.train_map(demos, map, context_keys=["joint_angle"], max_steps=1500).metrics
+metrics = nht.train_map(demos, map, context_keys=["joint_angle"], max_steps=1000).metrics
 print(f"NHT misses {metrics['validation_error']:.2e} of the motion of episodes that it has not seen")
 
 # %% [markdown]

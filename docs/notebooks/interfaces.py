@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 import nht
 import nht.envs
 
-torch.manual_seed(0)
+_ = torch.manual_seed(0)
 OPTIONS = {"start": "random", "swivel_range": 1.0}
 
 # %% [markdown]
@@ -53,7 +53,7 @@ maps = {
 }
 keys = ["tool_position", "joint_angle"]
 for name, map in maps.items():
-    metrics = nht.train_map(demos, map, context_keys=keys, max_steps=1000).metrics
+    metrics = nht.train_map(demos, map, context_keys=keys, max_steps=600).metrics
     print(f"{name}: misses {metrics['validation_error']:.1e}, certificate {metrics['certificate']:.3g}")
 
 # %% [markdown]
