@@ -20,6 +20,7 @@ TAKEN = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^()\s#]+)(#[^()\s]*)?\)")
 CODE = re.compile(r"(^```.*?^```$|`[^`\n]*`)", re.DOTALL | re.MULTILINE)
 LOADED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=\"((?:https?:)?//[^\"]+)\"")
+PLAYED = re.compile(r"<(?:video|source|img)\b[^>]*\bsrc=\"([^\":]+)\"")
 log = get_plugin_logger("links")
 
 
@@ -43,6 +44,15 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     for address in LOADED.findall(output):
         log.warning("%s loads %s from elsewhere.", page.file.src_uri, address)
     return output
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Warn of pictures and films that a page shows in HTML of its own, which MkDocs does not look into."""
+    site = Path(config.site_dir)
+    for page in site.rglob("*.html"):
+        for name in PLAYED.findall(page.read_text()):
+            if not (page.parent / name).exists():
+                log.warning("%s shows %s, which is not there.", page.relative_to(site), name)
 
 
 def _rewritten(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:
