@@ -9,14 +9,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import Files
-from mkdocs.structure.pages import Page
-
 WANTED = re.compile(r"^\{\{ help\((\w+)\) \}\}$", re.MULTILINE)
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, **_: object) -> str:
     """Replace ``{{ help(NAME) }}``, a line of its own, by what the recipe prints."""
     return WANTED.sub(lambda found: f"```text\n{help_of(found.group(1))}```\n", markdown)
 

@@ -1,7 +1,7 @@
 """Links that lead out of ``docs/`` into the repository, as they do on a page read there, made to work in the site.
 
-A picture or a file of the repository is copied into the site, below ``files/``; a folder, which a site cannot show, becomes
-its name. Pages that lie elsewhere in the repository are taken into the site by ``TAKEN``.
+A picture or a file of the repository is copied into the site, below ``files/``; a folder, which a site cannot show,
+becomes its name. Pages that lie elsewhere in the repository are taken into the site by ``TAKEN``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return "".join(pieces)
 
 
-def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+def on_post_page(output: str, page: Page, **_: object) -> str:
     """Warn of whatever a page would load from elsewhere."""
     for address in LOADED.findall(output):
         log.warning("%s loads %s from elsewhere.", page.file.src_uri, address)
@@ -63,7 +63,7 @@ def _rewritten(text: str, page: Page, config: MkDocsConfig, files: Files) -> str
         mark, words, link, anchor = found.groups()
         words = LINK.sub(replace, words)  # a picture that is a link
         target = Path(os.path.normpath(source.parent / link))
-        if ":" in link or target.is_relative_to(docs) and source.is_relative_to(docs):
+        if ":" in link or (target.is_relative_to(docs) and source.is_relative_to(docs)):
             return f"{mark}[{words}]({link}{anchor or ''})"
         if not target.is_relative_to(root) or not target.exists():
             log.warning("%s links to %s, which is not in the repository.", page.file.src_uri, link)

@@ -1,8 +1,8 @@
 """Notebooks: Python files in percent format, run when the site is built, become pages with what their cells give.
 
-``# %%`` begins a cell of code, ``# %% [markdown]`` one of text, as VS Code, Spyder and Jupytext read them. All run in this
-process, each in a namespace of its own; an error in a cell ends the build. A cell shows what it prints, the value of a last
-expression, and the figures that it leaves open.
+``# %%`` begins a cell of code, ``# %% [markdown]`` one of text, as VS Code, Spyder and Jupytext read them. All run in
+this process, each in a namespace of its own; an error in a cell ends the build. A cell shows what it prints, the value
+of a last expression, and the figures that it leaves open.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Run every notebook, and put its page and figures in its place."""
     root = Path(config.config_file_path).parent
     os.environ.update({"NHT_ROOT": str(root)} | SETTINGS)
-    for source in [file for file in files if file.src_uri.startswith(FOLDER) and file.src_uri.endswith(".py")]:
+    for source in [
+        file for file in files if file.src_uri.startswith(FOLDER) and file.src_uri.endswith(".py")
+    ]:
         files.remove(source)
         page = source.src_uri.removesuffix(".py")
         text, figures = as_page(source.content_string, Path(page).name)

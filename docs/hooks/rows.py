@@ -1,7 +1,7 @@
 """Tables and numbers of the pages, made from the committed rows in ``benchmarks/results`` when the site is built.
 
-A page whose front matter says ``rows: true`` is a Jinja template. What it can call is in ``FUNCTIONS``; a file is named by
-its path below ``benchmarks/results``, and ``where`` is a condition as ``pandas.DataFrame.query`` takes it.
+A page whose front matter says ``rows: true`` is a Jinja template. What it can call is in ``FUNCTIONS``; a file is named
+by its path below ``benchmarks/results``, and ``where`` is a condition as ``pandas.DataFrame.query`` takes it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from typing import Any
 import numpy as np
 import pandas
 from jinja2 import Environment, StrictUndefined
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 from pandas import DataFrame, Series
 
@@ -25,7 +23,7 @@ FIELD = re.compile(r"\{([^{}:]+):?([^{}]*)\}")
 Rows = str | DataFrame
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Fill in the tables and numbers of a page."""
     if not page.meta.get("rows"):
         return markdown
@@ -55,14 +53,16 @@ def table(file: Rows, columns: Mapping[str, str], where: str = "", sort: Sequenc
     return markdown_table(list(columns), lines)
 
 
-def summary(file: Rows, by: Mapping[str, str], cells: Mapping[str, tuple[str, str, str]], order: Sequence[str] = ()) -> str:
+def summary(
+    file: Rows, by: Mapping[str, str], cells: Mapping[str, tuple[str, str, str]], order: Sequence[str] = ()
+) -> str:
     """A line for each group of rows.
 
     Args:
         file: of the rows.
         by: columns that make the groups, and their headings.
-        cells: by heading: a column, which of the group's rows, and a format of ``count``, ``mean``, ``median``, ``min``,
-            ``max``, ``share``, which is that of the group's rows that were taken, and ``all``, the values in order.
+        cells: by heading: a column, which of the group's rows, and a format of ``count``, ``mean``, ``median``,
+            ``min``, ``max``, ``share``, which is that of the group's rows that were taken, and ``all``, the values.
         order: of the groups, by their first column; others come behind.
     """
     lines = []
@@ -133,11 +133,14 @@ def markdown_table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> s
     for first, *others in lines:
         body.append(["" if others and first == above else first, *others])
         above = first
-    return "\n".join("| " + " | ".join(line) + " |" for line in [headings, ["---"] * len(headings), *body]) + "\n"
+    return (
+        "\n".join("| " + " | ".join(line) + " |" for line in [headings, ["---"] * len(headings), *body])
+        + "\n"
+    )
 
 
 def shown(show: str, values: Mapping[str, Any]) -> str:
-    """Values in a format, ``{name}`` or ``{name:.2f}``, whatever characters a name has; nothing where one is missing."""
+    """Values in a format, ``{name}`` or ``{name:.2f}``, whatever a name is made of; nothing where one is missing."""
     if any(values[name] is None or values[name] != values[name] for name, _ in FIELD.findall(show)):
         return ""
     return FIELD.sub(lambda found: format(values[found.group(1)], found.group(2)), show)

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Compose with TorchRL
 #
-# A map, a transform, and TorchRL's own parts: collector, replay buffer, loss. The task is Gymnasium's Reacher, of which nothing here knows anything; its two torques become one action. Budgets are
-# tiny, so that this page is built in seconds: what it shows is how things fit together, not how well they learn.
+# A map, a transform, and TorchRL's own parts: collector, replay buffer, loss. The task is Gymnasium's
+# Reacher, of which nothing here knows anything; its two torques become one action. Budgets are tiny, so that
+# this page is built in seconds: what it shows is how things fit together, not how well they learn.
 
 # %%
 import torch
@@ -22,7 +23,8 @@ _ = torch.manual_seed(0)
 # %% [markdown]
 # ## Demonstrations, and a map
 #
-# Here they come from a rollout of random torques along one direction that turns with the first joint; yours come from an expert, a person, or another policy.
+# Here they come from a rollout of random torques along one direction that turns with the first joint; yours
+# come from an expert, a person, or another policy.
 
 # %%
 raw = GymEnv("Reacher-v5")
@@ -48,7 +50,8 @@ trained = nht.train_map(demos, map, context_keys=["observation"], max_steps=500)
 # %% [markdown]
 # ## The environment that a policy sees
 #
-# The map knows its context keys by now. The action spec has one dimension; the torques that were executed stand in the data as `("next", "actuation")`.
+# The map knows its context keys by now. The action spec has one dimension; the torques that were executed
+# stand in the data as `("next", "actuation")`.
 
 # %%
 env = TransformedEnv(
@@ -59,7 +62,14 @@ env.action_spec
 
 # %%
 step = env.rollout(3)
-print("action", tuple(step["action"].shape), "context", tuple(step["context"].shape), "actuation", tuple(step["next", "actuation"].shape))
+print(
+    "action",
+    tuple(step["action"].shape),
+    "context",
+    tuple(step["context"].shape),
+    "actuation",
+    tuple(step["next", "actuation"].shape),
+)
 
 # %% [markdown]
 # ## A learner of your own
@@ -68,7 +78,9 @@ print("action", tuple(step["action"].shape), "context", tuple(step["context"].sh
 
 # %%
 actor = TensorDictModule(
-    nn.Sequential(MLP(in_features=10, out_features=1, num_cells=[32])), in_keys=["observation"], out_keys=["param"]
+    nn.Sequential(MLP(in_features=10, out_features=1, num_cells=[32])),
+    in_keys=["observation"],
+    out_keys=["param"],
 )
 policy = TensorDictSequential(actor, TanhModule(in_keys=["param"], out_keys=["action"]))
 
@@ -81,6 +93,7 @@ class Value(nn.Module):
         self.network = MLP(in_features=11, out_features=1, num_cells=[32])
 
     def forward(self, observation, action):
+        """The value, (*batch, 1)."""
         return self.network(torch.cat([observation, action], -1))
 
 
@@ -116,4 +129,5 @@ nht.save_map(map, "map.safetensors")
 ActionMapTransform("map.safetensors")
 
 # %% [markdown]
-# [The transform's rules](../how/transform.md) say where it may stand among other transforms, and [your own algorithm](../guides/algorithm.md) how to make this loop a recipe with checkpoints, workers and reports.
+# [The transform's rules](../how/transform.md) say where it may stand among other transforms, and [your own
+# algorithm](../guides/algorithm.md) how to make this loop a recipe with checkpoints, workers and reports.

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # A plane that turns with the posture
 #
-# The whole idea, on an arm small enough to draw: three joints in a plane, and a tool that is to slide along a line. It needs
-# one degree of freedom; the arm has three motors. Which joint velocities move the tool along the line **depends on the posture**.
+# The whole idea, on an arm small enough to draw: three joints in a plane, and a tool that is to slide along a
+# line. It needs one degree of freedom; the arm has three motors. Which joint velocities move the tool along
+# the line **depends on the posture**.
 
 # %%
 import numpy as np
@@ -26,8 +27,9 @@ def jacobian(q):
 
 
 # %% [markdown]
-# An expert slides the tool from left to right at a constant height, by the pseudo-inverse of its Jacobian. We write down what a map will see
-# (**context**: the joint angles) and what the motors got (**actuation**: joint velocities).
+# An expert slides the tool from left to right at a constant height, by the pseudo-inverse of its Jacobian. We
+# write down what a map will see (**context**: the joint angles) and what the motors got (**actuation**: joint
+# velocities).
 
 # %%
 rng = np.random.default_rng(0)
@@ -52,7 +54,8 @@ plt.show()
 # %% [markdown]
 # ## One plane for all postures
 #
-# Singular vectors give the direction that explains most of the motion. With $k = 1$ it is a line in the space of joint velocities, the same for all postures, and it misses a part:
+# Singular vectors give the direction that explains most of the motion. With $k = 1$ it is a line in the space
+# of joint velocities, the same for all postures, and it misses a part:
 
 # %%
 _, _, directions = np.linalg.svd(actuations)
@@ -64,8 +67,10 @@ print(f"SVD misses {share:.1%} of the motion")
 # %% [markdown]
 # ## A line that turns
 #
-# A unit vector $v$ makes a reflection $H(v) = I - 2 v v^\top$. The first column of $H(v)$ is a unit vector, too, and every direction can be reached by some $v$. So a network that gives $v$ for a context gives a basis $Q(c)$, and
-# however its weights are, the basis is orthonormal and turns no faster than the network does.
+# A unit vector $v$ makes a reflection $H(v) = I - 2 v v^\top$. The first column of $H(v)$ is a unit vector,
+# too, and every direction can be reached by some $v$. So a network that gives $v$ for a context gives a basis
+# $Q(c)$, and however its weights are, the basis is orthonormal and turns no faster than the network does.
+
 
 # %%
 def basis(v):
@@ -89,7 +94,8 @@ metrics = nht.train_map(demos, map, context_keys=["joint_angle"], max_steps=1000
 print(f"NHT misses {metrics['validation_error']:.2e} of the motion of episodes that it has not seen")
 
 # %% [markdown]
-# What the one action axis does along a demonstration: each joint's share changes, which no constant direction can do.
+# What the one action axis does along a demonstration: each joint's share changes, which no constant direction
+# can do.
 
 # %%
 import torch
@@ -108,7 +114,8 @@ plt.show()
 # %% [markdown]
 # ## Driving
 #
-# Now somebody gives one number, and the arm keeps to its line. With SVD the tool leaves the height that it should keep.
+# Now somebody gives one number, and the arm keeps to its line. With SVD the tool leaves the height that it
+# should keep.
 
 
 # %%
@@ -137,4 +144,6 @@ plt.title("The tool's path")
 plt.show()
 
 # %% [markdown]
-# That is all: a map that knows the posture turns one number into the motion that a task needs. [Compose with TorchRL](compose.md) puts it between a policy and an environment; [the mathematics](../how/mathematics.md) says what is proved.
+# That is all: a map that knows the posture turns one number into the motion that a task needs. [Compose with
+# TorchRL](compose.md) puts it between a policy and an environment; [the mathematics](../how/mathematics.md)
+# says what is proved.

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Compare interfaces
 #
-# The same demonstrations, several maps: which of them can do the task at all? This is WAMWipe, a seven-joint arm that slides its tool over a table; starts are random, with the elbow swivelled. Maps here are
-# trained for seconds; [How well maps fit](../results/maps.md) has them whole.
+# The same demonstrations, several maps: which of them can do the task at all? This is WAMWipe, a seven-joint
+# arm that slides its tool over a table; starts are random, with the elbow swivelled. Maps here are trained
+# for seconds; [How well maps fit](../results/maps.md) has them whole.
 
 # %%
 import torch
@@ -57,11 +58,13 @@ for name, map in maps.items():
     print(f"{name}: misses {metrics['validation_error']:.1e}, certificate {metrics['certificate']:.3g}")
 
 # %% [markdown]
-# A certificate is a proven bound on how fast the basis turns; nothing is known of autoencoders, so theirs is infinite.
+# A certificate is a proven bound on how fast the basis turns; nothing is known of autoencoders, so theirs is
+# infinite.
 #
 # ## The expert through each map
 #
-# A small error is not yet a level motion. So let the expert act *through* the map: project its actuation, and execute what comes back. If that fails, no policy can do the task through this map. The tolerance is tight,
+# A small error is not yet a level motion. So let the expert act *through* the map: project its actuation, and
+# execute what comes back. If that fails, no policy can do the task through this map. The tolerance is tight,
 # 5 mm.
 
 # %%

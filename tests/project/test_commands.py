@@ -15,7 +15,11 @@ import page_recipes
 from shell_commands import PAGES, ROOT, commands, name_of
 
 RECIPES = {
-    page: [words for words in dict.fromkeys(commands(page)) if words[0] in ("python", "torchrun") and "-m" in words]
+    page: [
+        words
+        for words in dict.fromkeys(commands(page))
+        if words[0] in ("python", "torchrun") and "-m" in words
+    ]
     for page in PAGES
 }
 # Composed, not run, and why.

@@ -63,7 +63,9 @@ def compose(module: str, words: list[str]) -> object:
 
     with pytest.MonkeyPatch.context() as patch:
         true_launch = launching.launch
-        patch.setattr(launching, "launch", lambda main, *how, **more: true_launch(_like(main, keep), *how, **more))
+        patch.setattr(
+            launching, "launch", lambda main, *how, **more: true_launch(_like(main, keep), *how, **more)
+        )
         try:
             _start(module, words)
         except Composed as composed:
@@ -72,7 +74,7 @@ def compose(module: str, words: list[str]) -> object:
 
 
 def run(module: str, words: list[str]) -> None:
-    """Run a recipe in this process, in the current folder, with a budget of a second; what it would write is removed first."""
+    """Run a recipe in this process, in the current folder, with a budget of a second, over what is there."""
     name = module.rpartition(".")[2]
     budget = BUDGETS.get(name, [])
     short = {word.partition("=")[0] for word in budget}
@@ -81,7 +83,8 @@ def run(module: str, words: list[str]) -> None:
         key, _, value = word.partition("=")
         if key not in short or value == "true":
             kept.append(f"{key}={SHORTER[key]}" if key in SHORTER else word)
-    words = [*kept, *(word for word in budget if word.partition("=")[0] not in {each.partition("=")[0] for each in kept})]
+    given = {word.partition("=")[0] for word in kept}
+    words = [*kept, *(word for word in budget if word.partition("=")[0] not in given)]
     config = compose(module, words)
     for place in (config.run.folder if isinstance(config, Training) else None, getattr(config, "out", None)):
         if place and name not in ("report", "export_map", "inspect_demos"):

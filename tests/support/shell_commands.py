@@ -1,4 +1,4 @@
-"""The commands of the pages: what bash makes of a block, with every program replaced by one that notes its arguments."""
+"""The commands of the pages: what bash makes of a block, with programs replaced by notes of their arguments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ PROGRAMS = ("python", "torchrun", "make", "pip", "wandb", "ray", "pytest", "git"
 NOTES = '{ printf "%s\\0" "${0##*/}" "$@"; printf "\\036\\0"; } >> "$COMMANDS"\n'
 # What stands for a program that a page only starts others with, or asks a batch system.
 OTHERS = {"srun": '"$@"\n', "scontrol": "echo node-1\n", "cd": ""}
-BATCH = {"SLURM_JOB_ID": "7", "SLURM_JOB_NUM_NODES": "2", "SLURM_ARRAY_TASK_ID": "1", "SLURM_CPUS_PER_TASK": "2", "SLURM_JOB_NODELIST": "node-[1-2]"}
+BATCH = {
+    "SLURM_JOB_ID": "7",
+    "SLURM_JOB_NUM_NODES": "2",
+    "SLURM_ARRAY_TASK_ID": "1",
+    "SLURM_CPUS_PER_TASK": "2",
+    "SLURM_JOB_NODELIST": "node-[1-2]",
+}
 
 
 def name_of(page: Path) -> str:
