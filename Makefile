@@ -47,7 +47,7 @@ typecheck: setup ## Check the types of the installed package
 
 docs: setup ## Build the site: warnings are errors, links are checked, notebooks are run
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	@echo 'The site: site/index.html'
+	@echo 'The site: site/index.html; with its search: $(BIN)/python -m http.server -d site'
 
 docs suite test-slow: export OMP_NUM_THREADS := 1
 docs suite test-slow: export WANDB_MODE := offline

@@ -7,6 +7,7 @@ import re
 import shutil
 import tomllib
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from torch.distributed.run import get_args_parser
@@ -55,6 +56,13 @@ def why_not_run(page: Path, words: tuple[str, ...]) -> str | None:
     return next((why for mark, why in LONG.items() if mark in words), None)
 
 
+class Place(NamedTuple):
+    """Where commands are run, and which were, whatever their seed: each is run once, on whatever pages it stands."""
+
+    folder: Path
+    ran: set[tuple[str, ...]]
+
+
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """A folder with what the pages take for granted."""
@@ -67,17 +75,21 @@ def place(tmp_path_factory):
         os.symlink(ROOT / "benchmarks", folder / "benchmarks")
         os.chdir(folder)
         page_recipes.prepare(ROOT / "tests" / "outside")
-        yield folder
+        yield Place(folder, set())
         os.chdir(before)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if RECIPES[page]], ids=name_of)
 def test_recipes_of_a_page(page, place, request, capsys):
     for words in RECIPES[page]:
-        module, overrides = recipe(tuple(word.replace("/shared/", f"{place}/shared/") for word in words))
-        if why_not_run(page, words):
+        module, overrides = recipe(
+            tuple(word.replace("/shared/", f"{place.folder}/shared/") for word in words)
+        )
+        same = tuple(word for word in words if not word.startswith("seed="))
+        if why_not_run(page, words) or same in place.ran:
             page_recipes.compose(module, overrides)
             continue
+        place.ran.add(same)
         if "video=true" in words:
             request.getfixturevalue("can_render")
         page_recipes.run(module, overrides)
@@ -85,8 +97,10 @@ def test_recipes_of_a_page(page, place, request, capsys):
 
 @pytest.mark.slow
 def test_the_smoke_search_of_the_pages_runs(place):
-    page_recipes._start("nht.recipes.search", ["search=smoke", f"folder={place}/runs/smoke", "num_workers=1"])
-    assert (place / "runs" / "smoke" / "rows.csv").exists()
+    page_recipes._start(
+        "nht.recipes.search", ["search=smoke", f"folder={place.folder}/runs/smoke", "num_workers=1"]
+    )
+    assert (place.folder / "runs" / "smoke" / "rows.csv").exists()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
