@@ -17,10 +17,11 @@ from pathlib import Path
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import nht
-from nht.envs import make_env
+from nht.envs import make_env, make_expert
 from nht.reading import naming
 from nht.recipes.agents.policy import load_policy
 from nht.recipes.config import CollectDemos
+from nht.recipes.data.answers import EXPERT_ACTION, Controller, shared_driving
 from nht.recipes.data.files import FILES, best_episodes, read_episodes
 from nht.recipes.data.recording import COPIES, endings, has_success, record_episodes, record_expert
 from nht.recipes.launch import launch
@@ -49,7 +50,9 @@ def _collect(config: CollectDemos) -> nht.Demos:
     if source.kind == "expert":
         return record_expert(config.env, config.demos, config.seed, config.out)
     if source.kind == "policy":
-        return record_policy(source.path, config.env, config.demos, config.seed, config.out, source.allow)
+        return record_policy(
+            source.path, config.env, config.demos, config.seed, config.out, source.allow, source.relabel
+        )
     if source.kind in FILES:
         return import_demos(source, config.env, config.demos.min_return, config.out)
     raise ValueError(f"unknown source.kind {source.kind!r}: choose from {['expert', 'policy', *FILES]}.")
@@ -62,15 +65,19 @@ def record_policy(
     seed: int,
     path: str | Path,
     allow: Sequence[str] = (),
+    relabel: bool = False,
 ) -> nht.Demos:
     """Record demonstrations of a finished run's policy, without exploration: the actuations that its map gives.
 
     The task's options are those of the run, but its episodes end at success and failure. Kept are successful episodes,
     if the task has a notion of success, and only those with a return of at least ``demos.min_return``, if that is set.
 
+    With ``relabel`` the actuations are those that the task's expert would give in the same states, and it drives every
+    other copy itself (DAgger, Ross et al. 2011): a map learns where its policies go. Kept is every episode, then.
+
     Raises:
         FileNotFoundError: if ``run`` holds no finished run.
-        ValueError: if it is of another task than ``env``.
+        ValueError: if it is of another task than ``env``, or a task without an expert is to be relabelled.
     """
     if run is None:
         raise ValueError("source=policy needs source.path: the folder of a finished run.")
@@ -78,18 +85,24 @@ def record_policy(
     trained = read_config(folder, allow)
     if trained.env.name != env.name:
         raise ValueError(f"{run} is a run of env {trained.env.name!r}, expected {env.name!r}, as env says.")
+    expert = make_expert(env.name) if relabel else None
     options = trained.env.options | endings(env.name)
     task_config = replace(trained.env, options=options, num_threads=env.num_threads)
-    simulation = mapped_env(task_config, kept_map(folder, trained, allow=allow), seed=seed, num_envs=COPIES)
-    policy = load_policy(folder, simulation, trained)
+    map = kept_map(folder, trained, allow=allow)
+    simulation = mapped_env(task_config, map, seed=seed, num_envs=COPIES)
+    policy, task = load_policy(folder, simulation, trained), simulation.base_env.task
+    driver: Controller = policy
+    if expert is not None:
+        keys = map.context_keys if map.context_keys is not None else task_context_keys(env)
+        driver = shared_driving(expert, policy, map, keys if map.context_dim else [], task)
     with closing(simulation), set_exploration_type(ExplorationType.DETERMINISTIC):
         data, left_out = record_episodes(
-            simulation,
-            simulation.base_env.task,
-            policy,
+            simulation.base_env if relabel else simulation,
+            task,
+            driver,
             demos,
-            judged=has_success(env.name),
-            actuation_key=("next", "actuation"),
+            judged=has_success(env.name) and not relabel,
+            actuation_key=EXPERT_ACTION if relabel else ("next", "actuation"),
         )
     settings = {
         "options": options,
@@ -97,8 +110,10 @@ def record_policy(
         "min_return": demos.min_return,
         "left_out_episodes": left_out,
     }
-    expert = "raw policy" if trained.map.kind == "none" else f"{trained.map.kind} policy"
-    return nht.save_demos(data, path, env=env.name, seed=seed, expert=expert, settings=settings)
+    name = "raw policy" if trained.map.kind == "none" else f"{trained.map.kind} policy"
+    if expert is not None:
+        name = f"{type(expert).__name__} beside a {name}"
+    return nht.save_demos(data, path, env=env.name, seed=seed, expert=name, settings=settings)
 
 
 def import_demos(

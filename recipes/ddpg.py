@@ -45,7 +45,13 @@ def main(*configs: DDPG, together: str | None = None) -> None:
     rewards = reward_range(envs.train)
     cloning = cloning_of(algo.demos, ranks.device)
     loss = PaperDDPGLoss(
-        actor, critic, gamma=algo.gamma, action_l2=algo.action_l2, reward_range=rewards, cloning=cloning
+        actor,
+        critic,
+        gamma=algo.gamma,
+        action_l2=algo.action_l2,
+        reward_range=rewards,
+        cloning=cloning,
+        dropped=algo.dropped_quantiles,
     )
     target = JointSoftUpdate(loss, eps=algo.polyak)
     look_ahead = n_step_returns(algo.gamma, algo.n_steps)

@@ -50,8 +50,14 @@ class DemosConfig:
     path: str | None = path_field(None)  # folder that collect_demos wrote; None asks the expert
     transitions: int = 20_000  # how many the expert or policy gives, in whole episodes
     speed: float | None = None  # of the expert's tool [m/s]; None is its default
+    disturbance: float = 0.0  # deviation of noise on the motors, while the expert's own answer is recorded
     max_episode_steps: int = 1_000  # a demonstration ends at success, long before
     min_return: float | None = None  # of an episode worth keeping
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a negative disturbance."""
+        if not 0 <= self.disturbance < math.inf:
+            raise ValueError(f"demos.disturbance must be at least 0, got {self.disturbance}.")
 
 
 @dataclass
@@ -84,6 +90,9 @@ class SourceConfig:
     actuation_key: str | None = None  # hdf5, tensordict: None is "actions" and "action"
     episode_key: str | None = None  # hdf5, tensordict: integers that differ between episodes
     allow: list[str] = field(default_factory=list)  # policy: packages whose code the run may name
+    relabel: bool = (
+        False  # policy: record what the expert would do where the policy goes, and where it goes itself
+    )
     done_key: str | None = None  # hdf5, tensordict: true at an episode's last step; None takes the usual ones
 
 

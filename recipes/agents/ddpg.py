@@ -11,13 +11,13 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP
 from torchrl.objectives import DDPGLoss
 
 from nht.recipes.agents.cloning import ClonedDemosConfig, Cloning
-from nht.recipes.agents.critics import critic_network
+from nht.recipes.agents.critics import critic_network, quantile_loss
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig, mean_over
+from nht.recipes.agents.off_policy import OffPolicyConfig, mean_over
+from nht.recipes.agents.perceptrons import perceptron
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.settings import Setting, beside
 from nht.recipes.agents.table import Algorithm
@@ -51,14 +51,21 @@ class DDPGConfig(OffPolicyConfig):
     exploration_noise: float = 0.3  # standard deviation; actions lie in [-1, 1]
     noise_memory: float = 10.0  # steps after which the noise has forgotten itself; 1 is white noise
     random_action: float = 0.1  # probability of a uniform action instead
+    quantiles: int = 1  # of the return that the critic predicts; 1 is its mean
+    dropped_quantiles: int = 0  # the largest ones, which targets leave out
     demos: ClonedDemosConfig = field(default_factory=ClonedDemosConfig)  # to learn from, too
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""
         super().__post_init__()
         self._check_unit("random_action")
-        self._check_least(1, "target_update_every", "noise_memory")
-        self._check_least(0, "action_l2", "exploration_noise")
+        self._check_least(1, "target_update_every", "noise_memory", "quantiles")
+        self._check_least(0, "action_l2", "exploration_noise", "dropped_quantiles")
+        if self.dropped_quantiles >= self.quantiles:
+            raise ValueError(
+                f"algo.dropped_quantiles must be less than algo.quantiles={self.quantiles}, got "
+                f"{self.dropped_quantiles}."
+            )
 
 
 @dataclass
@@ -78,13 +85,12 @@ def networks(env: EnvBase, algo: DDPGConfig) -> tuple[TensorDictModule, TensorDi
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     norm = RunningNorm(size, algo.observation_clip).to(env.device)
-    hidden = {"num_cells": list(algo.hidden), "activation_class": nn.ReLU, "device": env.device}
-    network = HalfPrecisionMLP if algo.bfloat16 else MLP
-    actor = nn.Sequential(network(size, action_dim, **hidden), nn.Tanh())
+    layers = perceptron(algo, size, action_dim, env.device, normed=algo.layer_norm == "all")
+    actor = nn.Sequential(layers, nn.Tanh())
     return (
         TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
         TensorDictModule(actor, in_keys=["features"], out_keys=["action"]),
-        critic_network(env, algo),
+        critic_network(env, algo, algo.quantiles),
     )
 
 
@@ -105,6 +111,8 @@ class PaperDDPGLoss(DDPGLoss):
         reward_range: smallest and largest reward of a step, infinite where unknown; targets are clipped to the
             returns that these allow.
         cloning: a further term of the actor's loss, of demonstrated steps; None is none.
+        dropped: how many of the critic's largest quantiles targets leave out. A critic of several quantiles learns by
+            their Huber loss, ``quantile_loss``; its value is their mean.
     """
 
     def __init__(
@@ -116,9 +124,10 @@ class PaperDDPGLoss(DDPGLoss):
         action_l2: Setting,
         reward_range: Range = UNBOUNDED,
         cloning: Cloning | None = None,
+        dropped: int = 0,
     ) -> None:
         super().__init__(actor_network, value_network, delay_actor=True, delay_value=True)
-        self.gamma, self.action_l2 = gamma, action_l2
+        self.gamma, self.action_l2, self._dropped = gamma, action_l2, dropped
         self.__dict__["_cloning"] = cloning
         self.returns = return_range(reward_range, gamma)
         actor, critic = actor_network.module, value_network.module
@@ -134,11 +143,14 @@ class PaperDDPGLoss(DDPGLoss):
         outcome = tensordict["next"]
         with torch.no_grad():
             later = target_critic(outcome["features"], target_actor(outcome["features"]))
+            if self._dropped:
+                later = later.sort(-1).values[..., : -self._dropped]
             discount = beside(self.gamma, later) ** tensordict["steps_to_next_obs"].unsqueeze(-1)
             target = outcome["reward"] + discount * ~outcome["terminated"] * later
             target.clamp_(*(beside(bound, target) for bound in self.returns))
-        error = critic(tensordict["features"], tensordict["action"]) - target
-        return mean_over(tensordict, error.square()), {"target_value": target.squeeze(-1)}
+        found = critic(tensordict["features"], tensordict["action"])
+        errors = (found - target).square() if found.shape[-1] == 1 else quantile_loss(found, target)
+        return mean_over(tensordict, errors), {"target_value": target.mean(-1)}
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, a scalar; its gradient leaves the critic alone."""
@@ -146,12 +158,12 @@ class PaperDDPGLoss(DDPGLoss):
         features = tensordict["features"]
         action = actor(features)
         critic.requires_grad_(False)
-        value = critic(features, action)
+        value = critic(features, action).mean(-1, keepdim=True)
         critic.requires_grad_(True)
         loss = self.action_l2 * mean_over(tensordict, action.square()) - mean_over(tensordict, value)
         if self._cloning is not None:
             loss = loss + self._cloning.loss(
-                tensordict, action, value.squeeze(-1), lambda shown: critic(features, shown).squeeze(-1)
+                tensordict, action, value.squeeze(-1), lambda shown: critic(features, shown).mean(-1)
             )
         return loss, {}
 

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, EGreedyModule, OrnsteinUhlenbeckProcessModule
+from torchrl.modules import EGreedyModule, OrnsteinUhlenbeckProcessModule
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.common import LossModule
 
@@ -40,6 +40,7 @@ class OffPolicyConfig(AlgoConfig):
     polyak: float = 0.995  # share of the old target network that stays at each move
     pessimism: float = 0.8  # the critics start at this times the lowest return that is possible
     observation_clip: float = 5.0  # of the normalised observation
+    layer_norm: str = "none"  # of hidden layers, before each ReLU: none, critic or all
     bfloat16: bool = False  # the precision of hidden layers' matrix products; weights stay float32
     demos: ReplayDemosConfig = field(default_factory=ReplayDemosConfig)  # demonstrations to learn from, too
 
@@ -52,6 +53,8 @@ class OffPolicyConfig(AlgoConfig):
         counts = ("total_frames", "frames_per_batch", "n_steps", "batch_size", "buffer_size")
         self._check_least(1, *counts)
         self._check_least(0, "updates_per_batch", "warmup_frames", "random_frames")
+        if self.layer_norm not in ("none", "critic", "all"):
+            raise ValueError(f"algo.layer_norm must be none, critic or all, got {self.layer_norm!r}.")
         self._check_demos()
 
     def _check_demos(self) -> None:
@@ -135,19 +138,6 @@ def exploring(policy: TensorDictModule, env: EnvBase, algo: Exploration) -> Tens
     else:
         uniform = EGreedyModule(env.action_spec, random, random, device=env.device)
     return TensorDictSequential(policy, noise, uniform)
-
-
-class HalfPrecisionMLP(MLP):
-    """An ``MLP`` whose hidden layers multiply in bfloat16. The last one adds up in float32: values need more digits."""
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """``(*batch, size)``, or parts of it, to ``(*batch, out)``."""
-        hidden = torch.cat(inputs, -1)
-        *layers, last = self
-        with torch.autocast(hidden.device.type, torch.bfloat16):
-            for layer in layers:
-                hidden = layer(hidden)
-        return last(hidden.float())
 
 
 class JointSoftUpdate(SoftUpdate):

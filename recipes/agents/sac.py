@@ -18,12 +18,13 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, TanhNormal
+from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss
 
 from nht.recipes.agents.critics import CriticPair, critic_network
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig
+from nht.recipes.agents.off_policy import OffPolicyConfig
+from nht.recipes.agents.perceptrons import perceptron
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import Training
 
@@ -84,10 +85,7 @@ def networks(
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     norm = RunningNorm(size, algo.observation_clip).to(env.device)
-    network = HalfPrecisionMLP if algo.bfloat16 else MLP
-    head = network(
-        size, 2 * action_dim, num_cells=list(algo.hidden), activation_class=nn.ReLU, device=env.device
-    )
+    head = perceptron(algo, size, 2 * action_dim, env.device, normed=algo.layer_norm == "all")
     return (
         TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
         tanh_gaussian(GaussianHead(head)),

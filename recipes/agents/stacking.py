@@ -30,19 +30,47 @@ class StackedLinear(nn.Module):
         if self.weight.shape[1] == 1:  # for which a matrix product takes twice as long
             product = (rows * self.weight).sum(-1, keepdim=True) + self.bias.unsqueeze(1)
         else:
-            product = torch.baddbmm(self.bias.unsqueeze(1), rows, self.weight.mT)
+            product = stacked_linear(rows, self.weight, self.bias)
         return product.view(*inputs.shape[:-1], -1)
+
+
+class StackedLayerNorm(nn.Module):
+    """Layer normalisation of several learners, over the last dimension.
+
+    Args:
+        layers: of one shape.
+    """
+
+    def __init__(self, layers: Sequence[nn.LayerNorm]) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.stack([layer.weight.data for layer in layers]))  # (L, size)
+        self.bias = nn.Parameter(torch.stack([layer.bias.data for layer in layers]))  # (L, size)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """``(L, *batch, size)``, normalised."""
+        return stacked_norm(inputs.flatten(1, -2), self.weight, self.bias).view(inputs.shape)
+
+
+def stacked_linear(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """``(L, B, in)`` by weights ``(L, out, in)`` and biases ``(L, out)``, to ``(L, B, out)``."""
+    return torch.baddbmm(bias.unsqueeze(1), rows, weight.mT)
+
+
+def stacked_norm(rows: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """``(L, B, size)`` normalised over its last dimension, then scaled and moved by ``(L, size)`` each."""
+    normed = torch.nn.functional.layer_norm(rows, rows.shape[-1:])
+    return torch.addcmul(bias.unsqueeze(1), normed, weight.unsqueeze(1))
 
 
 def stacked(networks: Sequence[Network]) -> Network:
     """One network of the same class for all learners: its inputs ``(*batch, size)`` become ``(L, *batch, size)``.
 
-    Its linear layers become ``StackedLinear``, every other parameter and buffer gets a leading dimension; names stay,
-    so that ``of_learner`` gives the state of one of the networks.
+    Its linear layers become ``StackedLinear``, its layer norms ``StackedLayerNorm``; every other parameter and buffer
+    gets a leading dimension. Names stay, so that ``of_learner`` gives the state of one of the networks.
 
     Args:
-        networks: of one shape, one for each learner. Modules with parameters of their own beside linear layers must
-            be written for a leading dimension.
+        networks: of one shape, one for each learner. Other modules with parameters of their own must be written for a
+            leading dimension.
 
     Raises:
         ValueError: if their parameters are of different shapes; names the learner.
@@ -69,6 +97,8 @@ def _stack_into(result: nn.Module, networks: Sequence[nn.Module]) -> None:
         children: list[Any] = [network.get_submodule(name) for network in networks]
         if isinstance(child, nn.Linear):
             setattr(result, name, StackedLinear(children))
+        elif isinstance(child, nn.LayerNorm):
+            setattr(result, name, StackedLayerNorm(children))
         else:
             _stack_into(child, children)
 

@@ -12,13 +12,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP
 from torchrl.objectives import TD3Loss
 
 from nht.recipes.agents.cloning import ClonedDemosConfig, Cloning
 from nht.recipes.agents.critics import CriticPair, critic_network
 from nht.recipes.agents.norm import RunningNorm
-from nht.recipes.agents.off_policy import HalfPrecisionMLP, OffPolicyConfig
+from nht.recipes.agents.off_policy import OffPolicyConfig
+from nht.recipes.agents.perceptrons import perceptron
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import Training
@@ -63,8 +63,7 @@ def networks(env: EnvBase, algo: TD3Config) -> tuple[TensorDictModule, TensorDic
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
     norm = RunningNorm(size, algo.observation_clip).to(env.device)
-    network = HalfPrecisionMLP if algo.bfloat16 else MLP
-    mean = network(size, action_dim, num_cells=list(algo.hidden), activation_class=nn.ReLU, device=env.device)
+    mean = perceptron(algo, size, action_dim, env.device, normed=algo.layer_norm == "all")
     return (
         TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
         TensorDictModule(nn.Sequential(mean, nn.Tanh()), in_keys=["features"], out_keys=["action"]),

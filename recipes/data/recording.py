@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -15,20 +14,21 @@ import nht
 from nht.envs import make_env, make_expert
 from nht.envs.registry import TASKS, find_task
 from nht.envs.task import BatchedTask
+from nht.recipes.data.answers import EXPERT_ACTION, Controller, Disturbance, answering
 from nht.recipes.progress_bar import progress_bar
 from nht.recipes.sections import DemosConfig, EnvConfig
 
 COPIES = 100
 RECORDED = ("reward", "success", "terminated", "truncated", "done")
 
-Controller = Callable[[TensorDictBase], TensorDictBase]
-"""Writes ``"action"`` into the environment's observations."""
-
 
 def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Path) -> nht.Demos:
     """Run the expert until there are ``demos.transitions`` transitions of good episodes, and save them.
 
     Episodes end at success. Those that fail or run out of time are left out, and counted in the manifest.
+
+    With ``demos.disturbance`` noise moves the motors off the expert's way, and its answer to that is recorded, not what
+    was done (DART, Laskey et al. 2017): a map sees contexts beside the way.
 
     Raises:
         FileExistsError: if ``path`` exists.
@@ -41,14 +41,24 @@ def record_expert(env: EnvConfig, demos: DemosConfig, seed: int, path: str | Pat
     options = env.options | endings(env.name) | {"max_episode_steps": demos.max_episode_steps}
     simulation = make_env(env.name, COPIES, env.num_threads, seed=seed, **options)
 
+    answer = answering(expert, simulation.task)
+    disturb = Disturbance(demos.disturbance, seed) if demos.disturbance else None
+
     def act(current: TensorDictBase) -> TensorDictBase:
-        observation = {key: current[key].numpy() for key in simulation.task.observation_sizes}
-        return current.set("action", torch.from_numpy(expert(observation)).float())
+        current = answer(current)
+        wanted = current[EXPERT_ACTION]
+        return current.set("action", wanted if disturb is None else disturb(wanted))
 
     with closing(simulation):
         data, left_out = record_episodes(
-            simulation, simulation.task, act, demos, judged=has_success(env.name)
+            simulation,
+            simulation.task,
+            act,
+            demos,
+            judged=has_success(env.name),
+            actuation_key="action" if disturb is None else EXPERT_ACTION,
         )
+    settings = settings | ({"disturbance": demos.disturbance} if demos.disturbance else {})
     manifest = {"options": options, "expert": settings, "left_out_episodes": left_out}
     name = type(expert).__name__
     return nht.save_demos(data, path, env=env.name, seed=seed, expert=name, settings=manifest)
@@ -82,7 +92,8 @@ def record_episodes(
         act: chooses the actions.
         demos: how many transitions, and the return that a good episode must have.
         judged: whether a good episode must end in success.
-        actuation_key: key of the executed actuation in the data of a step.
+        actuation_key: key of the executed actuation in the data of a step. With ``EXPERT_ACTION``, which was not
+            executed, the rewards and next observations, which are not its, are left out.
 
     Returns:
         the good episodes, one after the other, and how many others ended.
@@ -126,6 +137,8 @@ def _transition(
         "next": {key: outcome[key] for key in keys},
         "good": good,
     }
+    if actuation_key == EXPERT_ACTION:
+        del entries["reward"], entries["next"]
     return TensorDict(entries, batch_size=stepped.batch_size)
 
 

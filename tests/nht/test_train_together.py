@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import nht
-from nht import train_together
+from nht import steps_together
 from nht.demos import Demos
 from nht.limits_together import LimitsTogether
 from nht.lipschitz import LipschitzProjection
@@ -142,7 +142,7 @@ def test_a_map_that_is_done_leaves_the_others_calls(demos: Demos, monkeypatch: p
             rows.append(counts)
             super().__init__(networks, counts)
 
-    monkeypatch.setattr(train_together, "NetworksTogether", Watched)
+    monkeypatch.setattr(steps_together, "NetworksTogether", Watched)
     maps = varied()[:3]
     found = succeeded(train_maps(demos, maps, batch_size=[3, 4, 5], max_steps=[20, 400, 300], patience=250))
     assert rows == [[3, 4, 5], [4, 5], *([[4]] if found[1].metrics["steps"] > 300 else [])]

@@ -88,9 +88,10 @@ LAYERS = {
     "nht.networks_together": 2,
     "nht.limits_together": 6,
     "nht.adam_together": 1,
-    "nht.train_together": 9,
+    "nht.steps_together": 9,
+    "nht.train_together": 10,
     "nht.export": 8,
-    "nht": 10,
+    "nht": 11,
 }
 FAMILY_LAYER = 4
 

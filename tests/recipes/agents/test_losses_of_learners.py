@@ -83,9 +83,11 @@ def replayed(size=24):
 @pytest.mark.parametrize("rewards", [(-1.0, 0.0), (-float("inf"), float("inf"))])
 @pytest.mark.parametrize("settings", DDPG_SETTINGS.values(), ids=DDPG_SETTINGS)
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_losses_of_ddpg(env, settings, rewards, bfloat16):
-    networks = own(ddpg, env, DDPGConfig(hidden=[16, 16], bfloat16=bfloat16))
+@pytest.mark.parametrize("more", [{}, {"layer_norm": "all", "quantiles": 5, "dropped_quantiles": 2}])
+def test_losses_of_ddpg(env, settings, rewards, bfloat16, more):
+    networks = own(ddpg, env, DDPGConfig(hidden=[16, 16], bfloat16=bfloat16, **more))
     stack = together(networks)
+    settings = settings | {"dropped": more.get("dropped_quantiles", 0)}
     loss = PaperDDPGLoss(*stack, **settings, reward_range=rewards)
     batch = replayed()
     losses = loss(batch)

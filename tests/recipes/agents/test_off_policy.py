@@ -28,9 +28,10 @@ SHORT = ("algo.total_frames=100", "evaluation.every=100", "algo.random_frames=0"
 
 @pytest.mark.parametrize("bfloat16", [False, True])
 @pytest.mark.parametrize("hidden", [[24, 16], []])
-def test_a_pair_of_critics_gives_what_each_gives_alone(bfloat16, hidden):
+@pytest.mark.parametrize("norm", ["none", "critic"])
+def test_a_pair_of_critics_gives_what_each_gives_alone(bfloat16, hidden, norm):
     env = nht.envs.make_env("half_cheetah")
-    _, actor, critic = networks(env, TD3Config(hidden=hidden, bfloat16=bfloat16))
+    _, actor, critic = networks(env, TD3Config(hidden=hidden, bfloat16=bfloat16, layer_norm=norm))
     loss = DirectTD3Loss(actor, critic, gamma=0.9)
     pair = CriticPair(critic.module, loss.qvalue_network_params)
     features, action = torch.randn(32, 17), torch.rand(32, 6)
@@ -56,7 +57,9 @@ def test_critics_start_near_the_lowest_return():
 
 def test_a_critic_of_another_make():
     critic = MLP(3, 1, num_cells=[4], activation_class=nn.Tanh)
-    with pytest.raises(TypeError, match="a pair of critics needs an MLP of Linear and ReLU layers, got MLP"):
+    with pytest.raises(
+        TypeError, match="a pair of critics needs an MLP of Linear, LayerNorm and ReLU layers, got MLP"
+    ):
         CriticPair(critic, None)
 
 

@@ -12,7 +12,7 @@ from torchrl.modules import MLP
 
 from nht.recipes.agents.adam import LearnersAdam, clip_gradients
 from nht.recipes.agents.norm import ReturnNorm, RunningNorm
-from nht.recipes.agents.off_policy import HalfPrecisionMLP
+from nht.recipes.agents.perceptrons import HalfPrecisionMLP
 from nht.recipes.agents.ppo import GaussianActor
 from nht.recipes.agents.settings import beside, largest
 from nht.recipes.agents.stacking import of_learner, stacked
@@ -20,9 +20,14 @@ from nht.recipes.agents.stacking import of_learner, stacked
 SIZES = st.integers(1, 9)
 
 
-def networks(learners, size, hidden, out, kind=MLP, seed=0):
+def networks(learners, size, hidden, out, kind=MLP, seed=0, normed=False):
     torch.manual_seed(seed)
-    return [kind(size, out, num_cells=hidden, activation_class=nn.ReLU) for _ in range(learners)]
+    norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in hidden]}
+    own = norm if normed and hidden else {}
+    several = [kind(size, out, num_cells=hidden, activation_class=nn.ReLU, **own) for _ in range(learners)]
+    for layer in (layer for network in several for layer in network if isinstance(layer, nn.LayerNorm)):
+        nn.init.normal_(layer.weight), nn.init.normal_(layer.bias)
+    return several
 
 
 @given(
@@ -32,14 +37,15 @@ def networks(learners, size, hidden, out, kind=MLP, seed=0):
     out=SIZES,
     batch=st.lists(st.integers(1, 4), min_size=1, max_size=3),
     seed=st.integers(0, 99),
+    normed=st.booleans(),
 )
-def test_a_stacked_network_is_each_network_on_its_own_rows(learners, size, hidden, out, batch, seed):
-    own = networks(learners, size, hidden, out, seed=seed)
+def test_a_stacked_network_is_each_network_on_its_own_rows(learners, size, hidden, out, batch, seed, normed):
+    own = networks(learners, size, hidden, out, seed=seed, normed=normed)
     inputs = torch.randn(learners, *batch, size)
     outputs = stacked(own)(inputs)
     assert outputs.shape == (learners, *batch, out)
     for network, rows, found in zip(own, inputs, outputs, strict=True):
-        torch.testing.assert_close(found, network(rows), rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(found, network(rows), rtol=1e-5, atol=1e-5)
 
 
 @given(learners=st.integers(1, 4), hidden=st.lists(SIZES, max_size=2), seed=st.integers(0, 99))
@@ -72,8 +78,9 @@ def test_stacking_leaves_the_networks_alone():
         )
 
 
-def test_gradients_are_those_of_each_network():
-    own = networks(3, 4, [8, 8], 2)
+@pytest.mark.parametrize("normed", [False, True])
+def test_gradients_are_those_of_each_network(normed):
+    own = networks(3, 4, [8, 8], 2, normed=normed)
     together = stacked(own)
     inputs = torch.randn(3, 16, 4)
     together(inputs).square().mean((1, 2)).sum().backward()

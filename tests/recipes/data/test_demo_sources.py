@@ -301,6 +301,46 @@ def test_a_policys_demonstrations_are_what_the_motors_got(run, tmp_path):
     assert collect(tmp_path / "other", *overrides, "seed=4").fingerprint != demos.fingerprint
 
 
+def expected_answers(demos):
+    """What the expert does in the recorded states."""
+    expert = nht.envs.make_expert("wam_wipe")
+    return torch.from_numpy(expert({key: demos.data[key].numpy() for key in ("joint_angle", "goal")})).float()
+
+
+def test_disturbed_demonstrations_are_the_experts_answers_beside_its_way(tmp_path):
+    told = ["demos.transitions=300", "env.options.height_tolerance=0.05"]
+    disturbed = collect(tmp_path / "disturbed", *told, "demos.disturbance=0.1")
+    torch.testing.assert_close(disturbed.actuation, expected_answers(disturbed), rtol=1e-4, atol=1e-4)
+    assert not {"reward", "next"} & set(disturbed.data.keys())
+    assert disturbed.manifest["settings"]["expert"] == {"disturbance": 0.1}
+    clean = collect(tmp_path / "clean", *told)
+    height = [abs(demos.data["tool_position"][:, 2] - 0.0).std() for demos in (clean, disturbed)]
+    assert height[1] > 3 * height[0]
+    again = collect(tmp_path / "again", *told, "demos.disturbance=0.1")
+    assert again.fingerprint == disturbed.fingerprint
+    other = collect(tmp_path / "other", *told, "demos.disturbance=0.1", "seed=1")
+    assert other.fingerprint != disturbed.fingerprint
+    train = ["map.max_steps=10", f"demos.path={tmp_path / 'disturbed'}", "algo.demos.transitions=100"]
+    with pytest.raises(KeyError, match=r"lacks \['reward', 'next/observation'\], which algo.demos needs"):
+        ddpg.main(configure(DDPG, "ddpg", [*train, f"run.folder={tmp_path / 'run'}"]))
+
+
+def test_the_expert_answers_where_a_policy_goes(run, tmp_path):
+    overrides = ["source=policy", "source.relabel=true", f"source.path={run}", "demos.transitions=300"]
+    demos = collect(tmp_path / "demos", *overrides)
+    assert demos.manifest["expert"] == "WipeExpert beside a nht policy"
+    torch.testing.assert_close(demos.actuation, expected_answers(demos), rtol=1e-4, atol=1e-4)
+    assert not {"reward", "next"} & set(demos.data.keys())
+    ends = torch.cat([demos.episode[1:] != demos.episode[:-1], torch.ones(1, dtype=torch.bool)])
+    success = demos.data["success"][ends]
+    assert success.any()  # the expert's episodes
+    assert not success.all()  # those of a policy that hardly learned
+    nht.train_map(
+        demos, nht.NHT(10, 7, 2, hidden=(8,)), context_keys=["tool_position", "joint_angle"], max_steps=5
+    )
+    assert collect(tmp_path / "again", *overrides).fingerprint == demos.fingerprint
+
+
 def test_where_a_task_knows_no_success_the_return_decides():
     env = nht.envs.make_env("wam_wipe", num_envs=8, seed=0, max_episode_steps=30)
     expert = nht.envs.make_expert("wam_wipe")
@@ -335,6 +375,11 @@ def test_where_a_task_knows_no_success_the_return_decides():
             ["source=youtube"],
             ValueError,
             r"Could not find 'source/youtube'.*expert.*hdf5.*minari.*policy.*tensordict",
+        ),
+        (
+            ["demos.disturbance=-1"],
+            ValueError,
+            r"demos.disturbance must be at least 0, got -1",
         ),
         (
             ["source.kind=youtube"],

@@ -1,0 +1,75 @@
+"""What lifts NHT's ceiling on WAMGrasp: another dimension, corrections, or demonstrations beside the expert's way.
+
+DDPG with 10,000 of the expert's steps in replay, 200,000 steps, five seeds, through NHTs that differ in k and in what
+they were trained on, 100,000 transitions each:
+
+- ``clean``: the expert's own episodes.
+- ``disturbed``: noise moves the arm off the expert's way, its answers are recorded (DART).
+- ``relabelled``: an agent that learned through the clean map drives every other copy, the expert's answers are
+  recorded in all (DAgger).
+
+``corrected`` adds a residual of 0.3 rad/s. Writes rows, table and figure to ``results/grasp_ceiling``.
+
+    python benchmarks/learning/grasp_ceiling.py FOLDER
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pandas
+
+from populations import ARMS, made, plot, save, trained_runs
+
+OUT = Path(__file__).parents[1] / "results" / "grasp_ceiling"
+TASK = ["env=wam_grasp", "demos.transitions=100_000"]
+LEARNER = [*ARMS, "env=wam_grasp", "algo=ddpg_grasp", "map.action_scale=1", "algo.total_frames=200_000"]
+COLOURS = {"clean": "#0072B2", "disturbed": "#D55E00", "relabelled": "#009E73"}
+CORRECTIONS = {"": [], ", corrected": ["map.residual=0.3"]}
+VARIANTS = [
+    ("clean", 3, ""),
+    ("clean", 4, ""),
+    ("disturbed", 3, ""),
+    ("disturbed", 4, ""),
+    ("relabelled", 3, ""),
+    ("relabelled", 4, ""),
+    ("clean", 3, ", corrected"),
+    ("clean", 4, ", corrected"),
+]
+
+
+def main() -> None:
+    """Train what is missing, and show what was learned."""
+    folder = Path(sys.argv[1]).resolve()
+    parts, looks = [], {}
+    for kind, action_dim, corrected in VARIANTS:
+        name = f"{kind}, k = {action_dim}{corrected}"
+        demos = made(folder / kind, "collect_demos", [*TASK, *source(kind, folder)])
+        map = made(
+            folder / f"{kind}-{action_dim}.safetensors",
+            "train_map",
+            ["env=wam_grasp", f"demos.path={demos}", "map=nht", f"map.action_dim={action_dim}"],
+        )
+        told = [*LEARNER, *CORRECTIONS[corrected], f"map.file={map}"]
+        replayed = [f"demos.path={folder / 'clean'}", "algo.demos.transitions=10_000"]
+        runs = trained_runs(folder / name.replace(", ", "-").replace(" = ", ""), [*told, *replayed])
+        parts.append(runs.assign(interface=name))
+        looks[name] = COLOURS[kind], "-" if action_dim == 4 else "--"
+        save(pandas.concat(parts, ignore_index=True), OUT, "wam_grasp")
+    several = pandas.concat(parts, ignore_index=True)
+    plain = [name for name in looks if "corrected" not in name]
+    plot(several[several["interface"].isin(plain)], OUT / "wam_grasp.png", looks)
+
+
+def source(kind: str, folder: Path) -> list[str]:
+    """Settings of the demonstrations of a kind."""
+    if kind == "disturbed":
+        return ["demos.disturbance=0.1"]
+    if kind == "relabelled":
+        return ["source=policy", "source.relabel=true", f"source.path={folder / 'clean-k3' / 'seed-0'}"]
+    return []
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""WAMWipe's hard corner through every interface, with and without demonstrations in replay, and what it breaks.
+
+Random starts, elbows swivelled by up to 1 rad, a tolerance of 5 mm; DDPG, 150,000 steps, five seeds. Maps are trained
+on the expert's 20,000 transitions (k = 2), of which 10,000 stand in the replay buffer where demonstrations take part.
+Writes rows, a table, curves, and success against the share of training episodes that violate the constraint, to
+``results/hard_corner``.
+
+    python benchmarks/learning/hard_corner.py FOLDER [INTERFACE ...]
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas
+
+from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
+from nht.recipes.study.figures import colour
+from nht.recipes.study.scores import interval
+from populations import ARMS, made, plot, save, trained_runs
+
+OUT = Path(__file__).parents[1] / "results" / "hard_corner"
+CORNER = [
+    "env=wam_wipe",
+    "env.options.start=random",
+    "env.options.swivel_range=1.0",
+    "env.options.height_tolerance=0.005",
+]
+LEARNER = [*CORNER, *ARMS, "map.action_scale=1", "algo.total_frames=160_000"]
+INTERFACES = ("nht", "svd", "scl", "laser", "jacobian", "raw")
+WAYS = {"": ([], ":"), ", demonstrations": (["algo.demos.transitions=10_000"], "-")}
+
+
+def main() -> None:
+    """Train what is missing, and show what was learned."""
+    folder = Path(sys.argv[1]).resolve()
+    demos = made(folder / "demos", "collect_demos", [*CORNER, "demos.transitions=20_000"])
+    parts, looks = [], {}
+    for interface in sys.argv[2:] or INTERFACES:
+        for way, (more, style) in WAYS.items():
+            run = folder / f"{interface}{way.replace(', ', '-')}"
+            driven = interface_of(interface, demos, folder)
+            runs = trained_runs(run, [*LEARNER, *driven, f"demos.path={demos}", *more])
+            parts.append(runs.assign(interface=f"{interface}{way}"))
+            looks[f"{interface}{way}"] = colour(interface), style
+            curves = pandas.concat(parts, ignore_index=True)
+            save(curves, OUT, "wam_wipe")
+    plot(curves, OUT / "curves.png", looks)
+    violations(curves, OUT / "violations.png", looks)
+
+
+def interface_of(kind: str, demos: Path, folder: Path) -> list[str]:
+    """The settings of an interface, whose map is trained if it has one to train."""
+    if kind in ("raw", "jacobian"):
+        return ["map=none" if kind == "raw" else "map=jacobian"]
+    told = [*CORNER, f"demos.path={demos}", f"map={kind}", "map.action_dim=2"]
+    return [f"map.file={made(folder / f'{kind}.safetensors', 'train_map', told)}"]
+
+
+def violations(curves: pandas.DataFrame, file: Path, looks: dict[str, tuple[str, str]]) -> None:
+    """Success at the end against the share of training episodes that violated the constraint: seeds, and means."""
+    figure, axes = plt.subplots(figsize=(6, 4.2), layout="constrained")
+    for name, group in curves.groupby("interface", sort=False):
+        seeds = group.groupby("seed")
+        broken, success = seeds[trained(FAILURE)].mean(), group[group[FRAMES] == group[FRAMES].max()]
+        success = success.set_index("seed")[tested(SUCCESS)]
+        own, style = looks[str(name)]
+        face = own if style == "-" else "none"
+        axes.scatter(broken, success, s=14, facecolors=face, edgecolors=own, alpha=0.5)
+        low, high = interval(success.to_numpy())
+        middle = np.array([[success.mean() - low], [high - success.mean()]]).clip(0)
+        axes.errorbar(
+            broken.mean(), success.mean(), middle, fmt="o", ms=8, color=own, markerfacecolor=face, label=name
+        )
+    axes.set(
+        xlabel="training episodes that violated the constraint",
+        ylabel="success after training",
+        xlim=(-0.02, 1.02),
+        ylim=(-0.05, 1.05),
+    )
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""Trains variants of a run, several seeds each as one population, and shows them: rows, a table, a figure.
+
+A population that is finished is not repeated, one that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas
+from matplotlib.axes import Axes
+
+from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
+from nht.recipes.study.curves import read_runs, summarise
+from nht.recipes.study.report import to_markdown
+from nht.recipes.study.scores import interval
+
+ARMS = ["algo.hidden=[128,128]", "algo.bfloat16=true", "evaluation.episodes=50", "evaluation.every=20_000"]
+"""Settings of the studies on the arm's tasks."""
+QUIET = ["evaluation.video=false", "run.wandb=false", "run.checkpoint_every=20_000"]
+COLUMNS = ["task", "interface", "seed", FRAMES, tested(SUCCESS), tested(FAILURE), trained(FAILURE), "seconds"]
+
+
+def made(file: Path, recipe: str, told: Sequence[str]) -> Path:
+    """What a recipe writes to ``file``: demonstrations or a map. Not made again if it is there."""
+    if not file.exists():
+        _run(recipe, [*told, f"out={file}"])
+    return file
+
+
+def trained_runs(run: Path, told: Sequence[str], seeds: int = 5) -> pandas.DataFrame:
+    """The evaluations of a population of DDPG, trained first if need be."""
+    _run("ddpg", [*told, *QUIET, f"seeds={seeds}", f"run.folder={run}", "run.resume=auto"])
+    return read_runs([run])
+
+
+def _run(recipe: str, told: Sequence[str]) -> None:
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, "-m", f"nht.recipes.{recipe}", *told], check=True, env=environment)
+
+
+def save(curves: pandas.DataFrame, out: Path, name: str) -> None:
+    """Write the rows and the table of variants, which are told apart by their ``interface``."""
+    out.mkdir(parents=True, exist_ok=True)
+    curves[COLUMNS].to_csv(out / f"{name}.csv", index=False)
+    table = summarise(curves)
+    # Of all training episodes, from the first on: what a person with a real robot asks for.
+    training = curves.groupby("interface", sort=False)[trained(FAILURE)].mean()
+    table["failed while training"] = [f"{training[name]:.2f}" for name in table["interface"]]
+    (out / f"{name}.md").write_text(to_markdown(table))
+    print(table.to_string(index=False), flush=True)
+
+
+def plot(curves: pandas.DataFrame, file: Path, looks: Mapping[str, tuple[str, str]]) -> None:
+    """Means over the seeds with their intervals; ``looks`` has the colour and line style of each variant."""
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for name, group in curves.groupby("interface", sort=False):
+        colour, style = looks[str(name)]
+        _draw(axes, group, str(name), colour, style)
+    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best", handlelength=3)
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
+
+
+def _draw(axes: Axes, runs: pandas.DataFrame, name: str, colour: str, style: str) -> None:
+    scores = runs.groupby(FRAMES)[tested(SUCCESS)]
+    bands = np.array([interval(values.to_numpy()) for _, values in scores])
+    axes.plot(scores.mean(), color=colour, linestyle=style, label=name)
+    axes.fill_between(scores.mean().index, *bands.T, color=colour, alpha=0.12, linewidth=0)
