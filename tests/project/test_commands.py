@@ -15,18 +15,27 @@ from torch.distributed.run import get_args_parser
 import page_recipes
 from shell_commands import PAGES, ROOT, commands, name_of
 
+MODULES = {
+    file.stem for file in (ROOT / "recipes").glob("*.py") if '__name__ == "__main__"' in file.read_text()
+}
+
+
+def starts_a_recipe(words: tuple[str, ...]) -> bool:
+    """Whether a command is ``python -m``, torchrun, or ``nht`` with a recipe's name."""
+    if words[0] == "nht":
+        return words[1] in MODULES
+    return words[0] in ("python", "torchrun") and "-m" in words
+
+
 RECIPES = {
-    page: [
-        words
-        for words in dict.fromkeys(commands(page))
-        if words[0] in ("python", "torchrun") and "-m" in words
-    ]
-    for page in PAGES
+    page: [words for words in dict.fromkeys(commands(page)) if starts_a_recipe(words)] for page in PAGES
 }
 # Composed, not run, and why.
 LONG = {
     "device=cuda": "needs a GPU",
     "torchrun": "starts several processes: tests/recipes/run/test_ranks.py does",
+    "nht.recipes.steer": "serves a page until it is told to end: tests/recipes/live does",
+    "nht.recipes.workspace": "writes to W&B's server",
     "nht.recipes.search": "starts Ray: the slow test below does",
     "collector=multi_sync": "starts processes: tests/recipes/run/test_collecting.py does",
     "compiled=true": "compiles for a minute: tests/nht/test_export.py does",
@@ -37,6 +46,7 @@ LISTED = {
     "git": "fetches",
     "wandb": "sends",
     "ray": "starts a cluster",
+    "nht": "prints: its own tests read it",
 }
 
 
@@ -44,6 +54,8 @@ def recipe(words: tuple[str, ...]) -> tuple[str, list[str]]:
     """Module and overrides of a command that starts a recipe."""
     if words[0] == "python":
         return words[2], list(words[3:])
+    if words[0] == "nht":
+        return f"nht.recipes.{words[1]}", list(words[2:])
     told = get_args_parser().parse_args(list(words[1:]))
     assert told.module
     return told.training_script, told.training_script_args
@@ -53,7 +65,7 @@ def why_not_run(page: Path, words: tuple[str, ...]) -> str | None:
     """Why a recipe is only composed."""
     if "results" in page.parts:
         return "takes hours: it is how results were made"
-    return next((why for mark, why in LONG.items() if mark in words), None)
+    return next((why for mark, why in LONG.items() if mark in (*words, recipe(words)[0])), None)
 
 
 class Place(NamedTuple):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PROGRAMS = ("python", "torchrun", "make", "pip", "wandb", "ray", "pytest", "git")
+PROGRAMS = ("python", "nht", "torchrun", "make", "pip", "wandb", "ray", "pytest", "git")
 NOTES = '{ printf "%s\\0" "${0##*/}" "$@"; printf "\\036\\0"; } >> "$COMMANDS"\n'
 # What stands for a program that a page only starts others with, or asks a batch system.
 OTHERS = {"srun": '"$@"\n', "scontrol": "echo node-1\n", "cd": ""}
