@@ -7,11 +7,13 @@ import tomllib
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 
 PLACE = Path("build/package")
 """Where the folder is, below the root; ``mkdocs.yml`` names it as the path of mkdocstrings."""
 
 
+@event_priority(100)  # before mkdocstrings looks whether the folder is there
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Make the folder anew."""
     root = Path(config.config_file_path).parent
