@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from urllib.parse import unquote
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import get_plugin_logger
@@ -18,9 +19,9 @@ from mkdocs.structure.pages import Page
 TAKEN = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Pages of the repository by their place in the site."""
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^()\s#]+)(#[^()\s]*)?\)")
-CODE = re.compile(r"(^```.*?^```$|`[^`\n]*`)", re.DOTALL | re.MULTILINE)
+CODE = re.compile(r"^```.*?^```$|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 LOADED = re.compile(r"<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)=\"((?:https?:)?//[^\"]+)\"")
-PLAYED = re.compile(r"<(?:video|source|img)\b[^>]*\bsrc=\"([^\":]+)\"")
+LOCAL = re.compile(r"<(?:a|video|source|img)\b[^>]*\b(?:src|href)=\"([^\":#?/][^\":#?]*)")
 log = get_plugin_logger("links")
 
 
@@ -34,9 +35,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Rewrite a page's links, but none in its code."""
-    pieces = CODE.split(markdown)
-    pieces[::2] = [_rewritten(text, page, config, files) for text in pieces[::2]]
-    return "".join(pieces)
+    code: list[str] = []
+
+    def hide(found: re.Match[str]) -> str:
+        code.append(found.group())
+        return f"\0{len(code) - 1}\0"
+
+    text = _rewritten(CODE.sub(hide, markdown), page, config, files)
+    return re.sub("\0([0-9]+)\0", lambda found: code[int(found.group(1))], text)
 
 
 def on_post_page(output: str, page: Page, **_: object) -> str:
@@ -47,12 +53,12 @@ def on_post_page(output: str, page: Page, **_: object) -> str:
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """Warn of pictures and films that a page shows in HTML of its own, which MkDocs does not look into."""
+    """Warn of what a page leads to or shows and is not there; MkDocs looks neither into HTML nor out of its folder."""
     site = Path(config.site_dir)
     for page in site.rglob("*.html"):
-        for name in PLAYED.findall(page.read_text()):
-            if not (page.parent / name).exists():
-                log.warning("%s shows %s, which is not there.", page.relative_to(site), name)
+        for name in set(LOCAL.findall(page.read_text())):
+            if not (page.parent / unquote(name)).exists():
+                log.warning("%s leads to %s, which is not there.", page.relative_to(site), name)
 
 
 def _rewritten(text: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -8,6 +8,7 @@ import re
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas
 import pytest
@@ -176,6 +177,38 @@ def test_an_error_in_a_notebook_ends_the_build():
 
 
 # Pages
+
+
+@pytest.mark.parametrize(
+    ("written", "made"),
+    [
+        ("[`a`](../LICENSE)", "[`a`](files/LICENSE)"),
+        (
+            "![a](../benchmarks/results/wam_grasp/film.png)",
+            "![a](files/benchmarks/results/wam_grasp/film.png)",
+        ),
+        ("[a](../CONTRIBUTING.md#versions)", "[a](contributing.md#versions)"),
+        ("[a](../README.md)", "[a](index.md)"),
+        ("[a](../pyproject.toml)", "[a](files/pyproject.toml.txt)"),
+        ("[a](../tests/outside)", "a"),
+        ("[a](../nowhere.md)", "a"),
+        ("[a](errors.md#questions)", "[a](errors.md#questions)"),
+        ("[a](https://mujoco.org)", "[a](https://mujoco.org)"),
+        ("`[a](../LICENSE)`", "`[a](../LICENSE)`"),
+        ("```sh\n[a](../LICENSE)\n```", "```sh\n[a](../LICENSE)\n```"),
+    ],
+)
+def test_links_out_of_the_folder_lead_into_the_site(written, made, caplog, monkeypatch):
+    from mkdocs.config import load_config
+    from mkdocs.structure.files import File, Files
+
+    page = SimpleNamespace(file=SimpleNamespace(abs_src_path=str(DOCS / "page.md"), src_uri="page.md"))
+    config = load_config(str(ROOT / "mkdocs.yml"))
+    links = hook("links")
+    # MkDocs makes files only while it builds.
+    monkeypatch.setattr(links.File, "generated", lambda _, place, **__: File(place, "docs", "site", False))
+    assert links.on_page_markdown(written, page, config, Files([])) == made
+    assert ("not in the repository" in caplog.text) == ("nowhere" in written)
 
 
 def test_every_page_is_in_the_navigation():
