@@ -135,13 +135,15 @@ class WAMWipe(WAMTask):
     def decorate(self, scene: mujoco.MjvScene, row: int) -> None:
         """Draw the goal as a disc, in a halo wider than the tool: green once reached, red after a violation."""
         colour = self._colour(row)
-        for radius, opacity in ((self.success_radius, 1.0), (2.5 * self.success_radius, 0.35)):
+        # As thin as can be told from the table: a thicker disc has a ragged shadow of its own along its edge.
+        discs = ((self.success_radius, 1.0, 0.0006), (2.5 * self.success_radius, 0.35, 0.0003))
+        for radius, opacity, height in discs:
             scene.ngeom += 1
             mujoco.mjv_initGeom(
                 scene.geoms[scene.ngeom - 1],
                 mujoco.mjtGeom.mjGEOM_CYLINDER,
-                np.array([radius, 0.001, 0.0]),
-                self.goal[row] + np.array([0.0, 0.0, 0.001]),
+                np.array([radius, 0.0002, 0.0]),
+                self.goal[row] + np.array([0.0, 0.0, height]),
                 np.eye(3).ravel(),
                 np.array([*colour, opacity], dtype=np.float32),
             )

@@ -6,12 +6,8 @@ python -m nht.recipes.compare_maps demos.path=runs/demos-wam_wipe maps=[nht,lase
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
 
 import matplotlib.pyplot as plt
 import pandas
@@ -19,6 +15,7 @@ import torch
 
 import nht
 from nht.recipes.config import CompareMaps
+from nht.recipes.figure_style import COLUMN, save_figure, style
 from nht.recipes.launch import launch
 from nht.recipes.maps.figures import basis_figure, tool_figure
 from nht.recipes.maps.interface import trained_map
@@ -30,6 +27,9 @@ from nht.recipes.maps.kinds import (
     map_context_keys,
     tasks_with_arm,
 )
+from nht.recipes.run.artifacts import demos_files, map_files
+from nht.recipes.run.dashboard import Dashboard, shown_on_dashboard, wanted
+from nht.recipes.study.figures import colour
 
 PAIRS = 5_000  # of contexts, to see how fast an interface changes
 LATENCY_SECONDS = 0.5  # spent on each measurement
@@ -57,6 +57,7 @@ def main(config: CompareMaps) -> None:
     fixed = {kind for kind in config.maps if find_kind(kind).fixed_width}
     if not config.maps or not config.action_dims:
         raise ValueError(f"nothing to compare: got maps={config.maps} and action_dims={config.action_dims}.")
+    wanted(config.run)  # whether W&B is installed, if it is
     torch.set_num_threads(config.torch_threads)
     demos = nht.load_demos(config.demos.path, env=config.env.name)
     chosen = [
@@ -73,15 +74,43 @@ def main(config: CompareMaps) -> None:
         trained = trained_map(settings, config.env, config.demos, config.seed)
         kind, k = settings.kind, trained.map.action_dim
         maps[kind, k] = trained.map
-        nht.save_map(trained.map, out / "maps" / f"{kind_in_file_name(kind)}-k{k}.safetensors")
+        nht.save_map(trained.map, _map_file(out, kind, k))
         rows.append({"map": kind, "k": k, **_measured(trained, demos)})
         table = pandas.DataFrame(rows)
         table.to_csv(out / "table.csv", index=False)
         (out / "table.md").write_text(_markdown(table))
-    _plot(table, out / "error.png")
+    plot_errors(table, out / "error.png")
     _draw(config, maps, demos, out)
+    with shown_on_dashboard(out, {"recipe": "compare_maps", **asdict(config)}, config.run) as dashboard:
+        if dashboard is not None:
+            _show(dashboard, table, maps, out, Path(config.demos.path))
     print((out / "table.md").read_text())
     print(f"saved in {out}")
+
+
+def _show(
+    dashboard: Dashboard,
+    table: pandas.DataFrame,
+    maps: dict[tuple[str, int], nht.ActionMap],
+    out: Path,
+    demos: Path,
+) -> None:
+    """Show table and figures, and hand the maps on; of those with as many axes, the one that fits best is the best."""
+    dashboard.take(demos_files(demos))
+    dashboard.table("maps", table)
+    for figure in sorted(out.glob("*.png")):
+        dashboard.picture(f"figures/{figure.stem}", figure)
+    best = table.loc[table.groupby("k")["validation_error"].idxmin().dropna()]
+    best_maps = set(zip(best["map"], best["k"], strict=True))
+    for row in table.to_dict("records"):
+        kind, k = str(row["map"]), int(row["k"])
+        file = _map_file(out, kind, k)
+        facts = {str(name): value for name, value in row.items() if name not in ("map", "k")}
+        dashboard.add(map_files(file, maps[kind, k], facts, best=(kind, k) in best_maps))
+
+
+def _map_file(out: Path, kind: str, action_dim: int) -> Path:
+    return out / "maps" / f"{kind_in_file_name(kind)}-k{action_dim}.safetensors"
 
 
 def _measured(trained: nht.MapTraining, demos: nht.Demos) -> dict[str, float]:
@@ -170,21 +199,18 @@ def _cell(value: str | float) -> str:
     return f"{value:,.0f}" if 1000 <= value < float("inf") else f"{value:.3g}"
 
 
-def _plot(table: pandas.DataFrame, path: Path) -> None:
+def plot_errors(table: pandas.DataFrame, path: Path) -> None:
     """Plot the error against k. The legend names maps with error 0, which a logarithmic axis cannot show."""
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for kind, rows in table.groupby("map", sort=False):
-        error = rows["validation_error"].where(rows["validation_error"] > 0)
-        label = str(kind) if error.notna().any() else f"{kind} (k = {rows['k'].iloc[0]}): exact"
-        axes.plot(rows["k"], error, marker="o", label=label)
-    axes.set(
-        xlabel="action dimensions k", ylabel="held-out error: share of |u|² that is missed", yscale="log"
-    )
-    axes.set_xticks(sorted(table["k"].unique()))
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside right upper", frameon=False)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    with style():
+        figure, axes = plt.subplots(figsize=(1.4 * COLUMN, COLUMN * 0.8), layout="constrained")
+        for kind, rows in table.groupby("map", sort=False):
+            error = rows["validation_error"].where(rows["validation_error"] > 0)
+            label = str(kind) if error.notna().any() else f"{kind} (k = {rows['k'].iloc[0]}): exact"
+            axes.plot(rows["k"], error, marker="o", label=label, color=colour(str(kind)))
+        axes.set(xlabel="action dimensions k", ylabel="held-out error, share of |u|²", yscale="log")
+        axes.set_xticks(sorted(table["k"].unique()))
+        figure.legend(loc="outside right upper")
+        save_figure(figure, path)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from nht.recipes.agents.ppo import PPO
 from nht.recipes.agents.table import find_algorithm
 from nht.recipes.run.metrics import check_outcome
 from nht.recipes.sections import (
+    ChartsConfig,
     DemosConfig,
     EnvConfig,
     MapConfig,
@@ -35,6 +36,7 @@ __all__ = [
     "Search",
     "TrainMap",
     "Training",
+    "Workspace",
 ]
 
 
@@ -70,6 +72,7 @@ class TrainMap:
     device: str = "cpu"  # where it is trained: cpu, cuda or cuda:1
     torch_threads: int = 1  # on cores that others use, too, one is often fastest
     out: str = path_field("")  # file of the map; never overwritten
+    run: ChartsConfig = field(default_factory=ChartsConfig)
 
     def __post_init__(self) -> None:
         """Raise ValueError for an alignment that does not exist."""
@@ -102,6 +105,7 @@ class CompareMaps:
     seed: int = 0  # of the weights, batches and held-out episodes
     torch_threads: int = 1  # on cores that others use, too, one is often fastest
     out: str = path_field("")  # folder of tables, figures and maps; never overwritten
+    run: ChartsConfig = field(default_factory=ChartsConfig)
 
 
 @dataclass
@@ -165,12 +169,24 @@ class Report:
     title: str = ""  # of figures and page; "" is what they show
     metric: str = "success"  # or return: what the table and the curves show of every evaluation
     lines: str = "interface"  # or algorithm: what is compared in a table and a figure
+    video: bool = True  # film the best policy of each, side by side, where there are policies
+    run: ChartsConfig = field(default_factory=ChartsConfig)
 
     def __post_init__(self) -> None:
         """Raise ValueError for a metric that evaluations do not have, or an unknown choice of lines."""
         check_outcome("metric", self.metric)
         if self.lines not in ("interface", "algorithm"):
             raise ValueError(f"lines must be interface or algorithm, got {self.lines!r}.")
+
+
+@dataclass
+class Workspace:
+    """``python -m nht.recipes.workspace``."""
+
+    entity: str = ""  # your name on W&B, or your team's
+    project: str = "nht"  # whose runs are shown
+    name: str = "nht: training"  # of the view
+    group_by: str | None = None  # Group or "Job Type": one line for the runs of each, with a band
 
 
 @dataclass

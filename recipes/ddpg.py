@@ -20,6 +20,7 @@ from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
+from nht.recipes.run.gradient_norms import GradientNorms
 from nht.recipes.run.graphs import graphed
 from nht.recipes.run.learners import Learners
 from nht.recipes.run.loop import Loop
@@ -76,6 +77,7 @@ def main(*configs: DDPG, together: str | None = None) -> None:
 
     batch_size = learners.each(ranks.share("algo.batch_size", algo.batch_size))
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
+    record.gradient_norms = GradientNorms(optimiser, "actor", "critic", learners=learners.count)
     explorer = exploring(policy, envs.train, algo)
     loop = Loop(
         folder,

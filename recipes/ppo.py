@@ -21,6 +21,7 @@ from nht.recipes.agents.settings import Setting
 from nht.recipes.launch import launch
 from nht.recipes.run.draws import Draws
 from nht.recipes.run.environments import RunEnvs
+from nht.recipes.run.gradient_norms import GradientNorms
 from nht.recipes.run.learners import Learners
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.population import open_run
@@ -58,6 +59,7 @@ def main(*configs: PPO, together: str | None = None) -> None:
     )
     minibatch = ranks.share("steps of a minibatch", algo.frames_per_batch // algo.minibatches)
     optimiser = LearnersAdam([(loss.parameters(), algo.learning_rate)], eps=1e-5)
+    record.gradient_norms = GradientNorms(optimiser, learners=learners.count)
     parts = {"optimiser": optimiser, "features": features, "rewards": rewards}
     loop = Loop(folder, ranks, envs, record, policy, loss, learners=learners, **parts)
 

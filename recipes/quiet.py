@@ -19,3 +19,18 @@ def quiet_libraries() -> None:
         os.environ[LEVEL] = "WARNING"
         logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message="No target network updater has been associated")
+
+
+def quiet_storages() -> None:
+    """Leave out of TorchRL's log, whatever its level, that a replay buffer got its storage: that is no news."""
+    logger = logging.getLogger("torchrl")
+    if not any(isinstance(known, _NoStorages) for known in logger.filters):
+        logger.addFilter(_NoStorages())
+
+
+class _NoStorages(logging.Filter):
+    """Lets all records through but those of new storages."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether the record is none of them."""
+        return not record.getMessage().startswith("Initialized Lazy")

@@ -17,6 +17,7 @@ from nht.recipes.agents.sac import SAC, DirectSACLoss, networks
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.gradient_norms import GradientNorms
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
@@ -61,6 +62,7 @@ def main(config: SAC) -> None:
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
     demos = replay_demos(folder, ranks, buffer, features, rows)
     batch_size = ranks.share("algo.batch_size", algo.batch_size)
+    record.gradient_norms = GradientNorms(optimiser, "actor", "critic", "temperature")
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
     loop = Loop(folder, ranks, envs, record, policy, loss, random_frames=algo.random_frames, **parts)
 

@@ -185,20 +185,35 @@ class EvaluationConfig:
     every: int = 10_000  # frames between two evaluations
     episodes: int = 100  # in each, one copy of the task for every episode
     final_episodes: int | None = None  # in the last one; None is as many
-    video: bool = True  # of the final policy
+    video: bool = True  # film the final policy
+    video_every: int | None = (
+        None  # frames between films on the way, at evaluations; None films the end alone
+    )
 
 
 @dataclass
-class RunConfig:
+class ChartsConfig:
+    """What is written to Weights and Biases."""
+
+    wandb: bool = True  # also write a Weights and Biases run: offline, unless you have logged in
+    wandb_project: str = "nht"  # where it stands there
+    wandb_name: str | None = None  # and under which name; None is that of its folder
+    wandb_group: str | None = None  # and with which others
+    wandb_job_type: str | None = None  # and as what; None is the recipe's name
+    wandb_tags: list[str] = field(default_factory=list)  # to find it by
+    wandb_notes: str | None = None  # a sentence about it
+
+
+@dataclass
+class RunConfig(ChartsConfig):
     """Where a run writes, and whether it resumes a run that it finds there."""
 
     folder: str = path_field("")  # of this run alone
     resume: Any = False  # true, or auto: go on if the folder holds a run, else begin
     checkpoint_every: int = 50_000  # frames
-    wandb: bool = True  # also write a Weights and Biases run: offline, unless you have logged in
-    wandb_project: str = "nht"  # where it stands there
-    wandb_group: str | None = None  # and with which others
-    wandb_job_type: str | None = None  # and as what
+    wandb_every: int | None = (
+        None  # frames between two rows of losses and rates; None is evaluation.every / 10
+    )
 
     def __post_init__(self) -> None:
         """Raise ValueError for an unknown value of ``resume``."""
@@ -232,11 +247,20 @@ class Training:
             "evaluation.every": self.evaluation.every,
             "run.checkpoint_every": self.run.checkpoint_every,
         }
+        more = {
+            "run.wandb_every": self.run.wandb_every,
+            "evaluation.video_every": self.evaluation.video_every,
+        }
+        frames |= {name: value for name, value in more.items() if value is not None}
         for name, value in frames.items():
             if value < self.algo.frames_per_batch or value % self.algo.frames_per_batch:
                 raise ValueError(
                     f"{name} must be a multiple of algo.frames_per_batch={self.algo.frames_per_batch}, got {value}."
                 )
+        if (films := self.evaluation.video_every) is not None and films % self.evaluation.every:
+            raise ValueError(
+                f"evaluation.video_every must be a multiple of evaluation.every={self.evaluation.every}, got {films}."
+            )
         if self.evaluation.every > self.algo.total_frames:
             raise ValueError(
                 f"evaluation.every={self.evaluation.every} must be at most algo.total_frames="
@@ -252,3 +276,11 @@ class Training:
                 f"algo.frames_per_batch={self.algo.frames_per_batch} must be a multiple of "
                 f"env.num_envs={self.env.num_envs}: every copy makes the same number of steps."
             )
+
+    @property
+    def charted_every(self) -> int:
+        """Environment steps between two rows of losses and rates on the dashboard."""
+        if self.run.wandb_every is not None:
+            return self.run.wandb_every
+        batch = self.algo.frames_per_batch
+        return max(batch, self.evaluation.every // 10 // batch * batch)

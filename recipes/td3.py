@@ -18,6 +18,7 @@ from nht.recipes.agents.td3 import TD3, DirectTD3Loss, networks
 from nht.recipes.launch import launch
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.folder import RunFolder
+from nht.recipes.run.gradient_norms import GradientNorms
 from nht.recipes.run.loop import Loop
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
@@ -64,6 +65,7 @@ def main(config: TD3) -> None:
     demos = replay_demos(folder, ranks, buffer, features, rows)
     batch_size = ranks.share("algo.batch_size", algo.batch_size)
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}
+    record.gradient_norms = GradientNorms(optimiser, "actor", "critic")
     explorer = exploring(policy, envs.train, algo)
     loop = Loop(folder, ranks, envs, record, explorer, loss, random_frames=algo.random_frames, **parts)
 

@@ -34,11 +34,14 @@ WAYS = {
 STYLES = {"none": ":", "prefilled": "--", "a quarter": "-"}
 
 
+LOOKS = {f"{map}, {way}": (colour(map), style) for map in ("nht", "raw") for way, style in STYLES.items()}
+
+
 def main() -> None:
     """Train what is missing, and show what was learned."""
     folder = Path(sys.argv[1]).resolve()
     for task in sys.argv[2:] or TASKS:
-        parts, looks = [], {}
+        parts = []
         for interface in ("nht", "raw"):
             driven = f"map.file={folder / task}-nht.safetensors" if interface == "nht" else "map=none"
             for way, demos in WAYS.items():
@@ -51,12 +54,10 @@ def main() -> None:
                     *demos,
                 ]
                 runs = trained_runs(folder / f"{task}-{interface}-{way.replace(' ', '-')}", told)
-                name = f"{interface}, {way}"
-                parts.append(runs.assign(interface=name))
-                looks[name] = colour(interface), STYLES[way]
+                parts.append(runs.assign(interface=f"{interface}, {way}"))
                 curves = pandas.concat(parts, ignore_index=True)
                 save(curves, OUT, task)
-                plot(curves, OUT / f"{task}.png", looks)
+                plot(curves, OUT / f"{task}.png", LOOKS)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas
 
+from nht.recipes.figure_style import PAGE, save_figure, style
 from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
 from nht.recipes.study.figures import colour
 from nht.recipes.study.scores import interval
@@ -40,12 +41,12 @@ def main() -> None:
     demos = made(folder / "demos", "collect_demos", [*CORNER, "demos.transitions=20_000"])
     parts, looks = [], {}
     for interface in sys.argv[2:] or INTERFACES:
-        for way, (more, style) in WAYS.items():
+        for way, (more, line) in WAYS.items():
             run = folder / f"{interface}{way.replace(', ', '-')}"
             driven = interface_of(interface, demos, folder)
             runs = trained_runs(run, [*LEARNER, *driven, f"demos.path={demos}", *more])
             parts.append(runs.assign(interface=f"{interface}{way}"))
-            looks[f"{interface}{way}"] = colour(interface), style
+            looks[f"{interface}{way}"] = colour(interface), line
             curves = pandas.concat(parts, ignore_index=True)
             save(curves, OUT, "wam_wipe")
     plot(curves, OUT / "curves.png", looks)
@@ -57,18 +58,19 @@ def interface_of(kind: str, demos: Path, folder: Path) -> list[str]:
     if kind in ("raw", "jacobian"):
         return ["map=none" if kind == "raw" else "map=jacobian"]
     told = [*CORNER, f"demos.path={demos}", f"map={kind}", "map.action_dim=2"]
-    return [f"map.file={made(folder / f'{kind}.safetensors', 'train_map', told)}"]
+    return [f"map={kind}", f"map.file={made(folder / f'{kind}.safetensors', 'train_map', told)}"]
 
 
+@style()
 def violations(curves: pandas.DataFrame, file: Path, looks: dict[str, tuple[str, str]]) -> None:
     """Success at the end against the share of training episodes that violated the constraint: seeds, and means."""
-    figure, axes = plt.subplots(figsize=(6, 4.2), layout="constrained")
+    figure, axes = plt.subplots(figsize=(0.75 * PAGE, 0.45 * PAGE), layout="constrained")
     for name, group in curves.groupby("interface", sort=False):
         seeds = group.groupby("seed")
         broken, success = seeds[trained(FAILURE)].mean(), group[group[FRAMES] == group[FRAMES].max()]
         success = success.set_index("seed")[tested(SUCCESS)]
-        own, style = looks[str(name)]
-        face = own if style == "-" else "none"
+        own, line = looks[str(name)]
+        face = own if line == "-" else "none"
         axes.scatter(broken, success, s=14, facecolors=face, edgecolors=own, alpha=0.5)
         low, high = interval(success.to_numpy())
         middle = np.array([[success.mean() - low], [high - success.mean()]]).clip(0)
@@ -81,10 +83,8 @@ def violations(curves: pandas.DataFrame, file: Path, looks: dict[str, tuple[str,
         xlim=(-0.02, 1.02),
         ylim=(-0.05, 1.05),
     )
-    axes.grid(alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+    save_figure(figure, file)
 
 
 if __name__ == "__main__":

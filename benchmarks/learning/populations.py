@@ -16,6 +16,7 @@ import numpy as np
 import pandas
 from matplotlib.axes import Axes
 
+from nht.recipes.figure_style import PAGE, save_figure, style, thousands
 from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
 from nht.recipes.study.curves import read_runs, summarise
 from nht.recipes.study.report import to_markdown
@@ -57,21 +58,23 @@ def save(curves: pandas.DataFrame, out: Path, name: str) -> None:
     print(table.to_string(index=False), flush=True)
 
 
+@style()
 def plot(curves: pandas.DataFrame, file: Path, looks: Mapping[str, tuple[str, str]]) -> None:
     """Means over the seeds with their intervals; ``looks`` has the colour and line style of each variant."""
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure, axes = plt.subplots(figsize=(0.75 * PAGE, 0.42 * PAGE), layout="constrained")
     for name, group in curves.groupby("interface", sort=False):
-        colour, style = looks[str(name)]
-        _draw(axes, group, str(name), colour, style)
-    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best", handlelength=3)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+        colour, line = looks[str(name)]
+        _draw(axes, group, str(name), colour, line)
+    task = curves["task"].iloc[0]
+    axes.set(xlabel="environment steps", ylabel="success of test episodes", ylim=(-0.03, 1.03), title=task)
+    thousands(axes)
+    # Names at the ends of curves would not say which line is dashed.
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=3)
+    save_figure(figure, file)
 
 
-def _draw(axes: Axes, runs: pandas.DataFrame, name: str, colour: str, style: str) -> None:
+def _draw(axes: Axes, runs: pandas.DataFrame, name: str, colour: str, line: str) -> None:
     scores = runs.groupby(FRAMES)[tested(SUCCESS)]
     bands = np.array([interval(values.to_numpy()) for _, values in scores])
-    axes.plot(scores.mean(), color=colour, linestyle=style, label=name)
+    axes.plot(scores.mean(), color=colour, linestyle=line, marker="o", markersize=2, label=name)
     axes.fill_between(scores.mean().index, *bands.T, color=colour, alpha=0.12, linewidth=0)

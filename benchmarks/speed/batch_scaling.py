@@ -19,6 +19,7 @@ from stepping import bare, torchrl
 from taking_turns import Method, Row, measure, provenance, show, tenths, write
 
 from nht.envs import TASKS, make_env
+from nht.recipes.figure_style import BLUE, GREY, PAGE, save_figure, style
 
 COPIES = (1, 4, 16, 64, 256, 1024)
 THREADS = (1, 2)
@@ -76,27 +77,31 @@ def summarise(name: str, methods: list[Method]) -> list[Row]:
     return rows
 
 
+@style()
 def plot(rows: list[Row], name: str) -> None:
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(PAGE, 0.42 * PAGE), sharey=True, layout="constrained")
     for axis, unit, title in zip(
         axes,
         ("90 %", "env steps/CPU s"),
         ("per second (best tenth)", "per processor second"),
         strict=True,
     ):
-        for method, colour in (("TorchRL", "C0"), ("bare", "C7")):
-            for threads, style in zip(THREADS, ("o-", "s--"), strict=True):
+        for method, colour in (("TorchRL", BLUE), ("bare", GREY)):
+            for threads, line_style in zip(THREADS, ("o-", "s--"), strict=True):
                 line = [row for row in rows if row["method"] == method and row["threads"] == threads]
                 label = f"{method}, {threads} thread{'s' * (threads > 1)}"
                 axis.plot(
-                    [row["copies"] for row in line], [row[unit] for row in line], style, c=colour, label=label
+                    [row["copies"] for row in line],
+                    [row[unit] for row in line],
+                    line_style,
+                    c=colour,
+                    label=label,
                 )
         axis.set(xscale="log", yscale="log", xlabel="copies", title=f"env steps {title}")
         axis.set_xticks(COPIES, [str(copies) for copies in COPIES])
-        axis.grid(alpha=0.3)
-    figure.suptitle(f"{name}: growth with the number of copies")
+    axes[0].set_ylabel(name)
     axes[0].legend()
-    figure.savefig(RESULTS.with_suffix(".png"), dpi=120)
+    save_figure(figure, RESULTS.with_suffix(".png"))
 
 
 def main() -> None:

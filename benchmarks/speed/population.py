@@ -42,6 +42,7 @@ from taking_turns import provenance
 
 import nht
 from nht.recipes.agents.table import find_algorithm
+from nht.recipes.figure_style import PAGE, save_figure, style
 from nht.recipes.launch import configure
 from nht.recipes.sections import Training
 from nht.recipes.study.space import draw_settings
@@ -184,30 +185,34 @@ def benchmark(chosen: list[str], rounds: int, pythons: dict[str, list[str]]) -> 
 
 
 def show(file: Path) -> None:
-    """Medians and spreads as a table, and how cost and memory grow with the learners."""
+    """Medians and spreads as a table, and the figure."""
     rows = pandas.read_csv(file)
     groups = rows.groupby(["setting", "who", "learners", "bfloat16"])
     table = groups["core_seconds"].agg(["median", "min", "max", "count"])
     table["of them evaluations"] = groups["evaluations"].median()
     table["memory [MB]"] = groups["memory"].median()
     print(table.round(0).to_string())
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.5))
+    draw(rows)
+
+
+@style()
+def draw(rows: pandas.DataFrame) -> None:
+    """How cost and memory grow with the learners."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(PAGE, 0.38 * PAGE), layout="constrained")
     for (setting, half), own in rows[rows["who"] == "nht"].groupby(["setting", "bfloat16"]):
         medians = own.groupby("learners")[["core_seconds", "memory"]].median()
         if len(medians) > 2:
             label = f"{setting}{', bfloat16' if half else ''}"
             left.plot(medians.index, medians["core_seconds"], "o-", label=label)
             right.plot(medians.index, medians["memory"], "o-", label=label)
-    left.set(ylabel="core-seconds per learner and 1,000,000 steps")
+    left.set(ylabel="core-seconds per learner and 1M steps")
     right.set(ylabel="memory of the process [MB]")
     left.legend()
     for axes in (left, right):
         axes.set(xscale="log", xlabel="learners", ylim=(0, None))
         axes.set_xticks(COUNTS, [str(count) for count in COUNTS])
         axes.minorticks_off()
-        axes.grid(alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(OUT / "growth.png", dpi=120)
+    save_figure(figure, OUT / "growth.png")
 
 
 def main() -> None:

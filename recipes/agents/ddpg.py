@@ -21,6 +21,7 @@ from nht.recipes.agents.perceptrons import perceptron
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.settings import Setting, beside
 from nht.recipes.agents.table import Algorithm
+from nht.recipes.run.metrics import VALUE
 from nht.recipes.sections import Training
 
 
@@ -132,13 +133,14 @@ class PaperDDPGLoss(DDPGLoss):
         self.returns = return_range(reward_range, gamma)
         actor, critic = actor_network.module, value_network.module
         target_actor, target_critic = deepcopy(actor), deepcopy(critic)
-        self.target_actor_network_params["module"].to_module(target_actor)
-        self.target_value_network_params["module"].to_module(target_critic)
+        parts = dict(self.named_children())  # as attributes, they warn that nothing moves them yet
+        parts["target_actor_network_params"]["module"].to_module(target_actor)
+        parts["target_value_network_params"]["module"].to_module(target_critic)
         # Not submodules: whose parameters they share are.
         self.__dict__["_networks"] = actor, critic, target_actor, target_critic
 
     def loss_value(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The critic's loss, a scalar, and the ``"target_value"`` ``(B,)`` of a batch ``(B,)``."""
+        """The critic's loss, a scalar; the ``"target_value"`` ``(B,)`` of a batch ``(B,)``, and the mean of that."""
         _, critic, target_actor, target_critic = self._networks
         outcome = tensordict["next"]
         with torch.no_grad():
@@ -150,7 +152,8 @@ class PaperDDPGLoss(DDPGLoss):
             target.clamp_(*(beside(bound, target) for bound in self.returns))
         found = critic(tensordict["features"], tensordict["action"])
         errors = (found - target).square() if found.shape[-1] == 1 else quantile_loss(found, target)
-        return mean_over(tensordict, errors), {"target_value": target.mean(-1)}
+        told = {"target_value": target.mean(-1), VALUE: mean_over(tensordict, target)}
+        return mean_over(tensordict, errors), told
 
     def loss_actor(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss, a scalar; its gradient leaves the critic alone."""

@@ -221,7 +221,7 @@ class GaussianPPOLoss(ClipPPOLoss):
         self._add = add
 
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
-        """The ``"loss"`` to descend on, a scalar, and the ``reports``, for a minibatch ``(B,)``."""
+        """The ``"loss"`` to descend on, a scalar, the ``reports``, and the critic's target, for a batch ``(B,)``."""
         features = batch["features"]
         log_prob, entropy = self.actor_network.module.log_prob(features, batch["sample"])
         log_ratio = log_prob - batch["sample_log_prob"]
@@ -235,7 +235,8 @@ class GaussianPPOLoss(ClipPPOLoss):
         with torch.no_grad():
             clipped_share = (clipped != ratio).float().mean(-1)
             reports = (objective, critic, entropy, clipped_share, -log_ratio.mean(-1))
-        return TensorDict({"loss": loss} | dict(zip(self.reports, reports, strict=True)))
+        target = {"target_value": batch["value_target"].squeeze(-1)}
+        return TensorDict({"loss": loss} | dict(zip(self.reports, reports, strict=True)) | target)
 
     def _normalised(self, advantage: Tensor) -> Tensor:
         """Advantages ``(B,)`` with mean 0 and deviation 1 over the minibatch, other processes' parts of it included."""

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from nht.recipes.quiet import quiet_storages
 from nht.recipes.run.draws import Draws
 
 STORED = (
@@ -27,6 +28,7 @@ STORED = (
 
 def replay_buffer(size: int, device: torch.device) -> TensorDictReplayBuffer:
     """An empty buffer of up to ``size`` steps, from which minibatches are drawn uniformly."""
+    quiet_storages()
     return TensorDictReplayBuffer(storage=LazyTensorStorage(size, device=device))
 
 

@@ -151,13 +151,16 @@ class DirectSACLoss(SACLoss):
         self.__dict__["_target_critics"] = CriticPair(critic, parts["target_qvalue_network_params"])
 
     def forward(self, batch: TensorDictBase) -> TensorDictBase:
-        """The three losses of a batch ``(B,)``, the temperature ``"alpha"`` and the ``"entropy"``, all scalars."""
-        loss_qvalue, _ = self.qvalue_v2_loss(batch)
+        """The three losses of a batch ``(B,)``, the temperature ``"alpha"`` and the ``"entropy"``, all scalars.
+
+        With the ``"target_value"`` ``(B,)`` of the critics.
+        """
+        loss_qvalue, more = self.qvalue_v2_loss(batch)
         loss_actor, drawn = self.actor_loss(batch)
         entropy = -drawn["log_prob"].mean()
         loss_alpha = self.log_alpha * (entropy - self._entropy_goal)
         values = (loss_actor, loss_qvalue, loss_alpha, self.log_alpha.detach().exp(), entropy)
-        return TensorDict(dict(zip(self.reports, values, strict=True)))
+        return TensorDict(dict(zip(self.reports, values, strict=True)) | more)
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critics' loss, a scalar, and the ``"target_value"`` ``(B,)`` of a batch ``(B,)``."""

@@ -127,9 +127,10 @@ class DirectTD3Loss(TD3Loss):
         self.__dict__["_target_critics"] = CriticPair(critic, parts["target_qvalue_network_params"])
 
     def forward(self, batch: TensorDictBase, *, actor: bool = True) -> TensorDictBase:
-        """The ``"loss_actor"``, 0 unless ``actor``, and the ``"loss_qvalue"`` of a batch ``(B,)``, scalars."""
+        """``"loss_actor"``, 0 unless ``actor``; ``"loss_qvalue"`` and its ``"target_value"``, of a batch ``(B,)``."""
         loss_actor = self.actor_loss(batch)[0] if actor else batch["action"].new_zeros(())
-        return TensorDict({"loss_actor": loss_actor, "loss_qvalue": self.value_loss(batch)[0]})
+        loss_qvalue, more = self.value_loss(batch)
+        return TensorDict({"loss_actor": loss_actor, "loss_qvalue": loss_qvalue} | more)
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The critics' loss, a scalar, and the ``"target_value"`` ``(B,)`` of a batch ``(B,)``."""

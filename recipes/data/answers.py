@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 import nht
@@ -55,7 +55,7 @@ class Disturbance:
 
 
 def shared_driving(
-    expert: Expert, policy: Controller, map: nht.ActionMap, keys: list[str], task: BatchedTask
+    expert: Expert, policy: Controller, map: nht.ActionMap, keys: Sequence[NestedKey], task: BatchedTask
 ) -> Controller:
     """A policy drives every other copy through its map, the expert the others; it answers in all of them.
 

@@ -5,10 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
-
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -21,19 +17,22 @@ from torch import Tensor
 from torch.func import jacfwd, vmap
 
 import nht
+from nht.recipes.figure_style import PAGE, looks, save_figure, style
 
-LONGEST = 250  # steps of a demonstration that can still be told apart
+LONGEST = 100  # steps of a demonstration that can still be told apart
 GRID = 9  # arrows along the longer side of the area where the tool was
 STEEP = Normalize(-0.1, 0.1)  # the vertical share of a motion within which its colour changes
 SLOPES = LinearSegmentedColormap.from_list("slopes", ["#1a73e8", "#202020", "#e8331a"])
 """Blue for down, black for level, red for up."""
 
 
+@style()
 def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: int, path: str | Path) -> None:
     """Plot the bases of maps along a demonstration: a column of panels per map, a row per basis vector.
 
     A panel has a line for each motor; of a long demonstration it shows the first steps. For a map that is not linear,
-    ``local_basis`` takes the place of the basis.
+    ``local_basis`` takes the place of the basis. Both are shown times ``action_scale``, as the actuation that an action
+    of 1 adds, and all panels have one scale.
 
     Args:
         maps: trained maps, by the name to show.
@@ -49,23 +48,30 @@ def basis_figure(maps: Mapping[str, nht.ActionMap], demos: nht.Demos, episode: i
         raise ValueError(f"there is no episode {episode}: the last is {int(demos.episode.max())}.")
     actuation = demos.actuation[rows]
     axes = max(map.action_dim for map in maps.values())
-    figure, panels = _panels(axes, len(maps), width=2.6, height=2.1, sharex=True)
+    width = min(1.6, (PAGE - 0.5) / len(maps))
+    figure, panels = _panels(
+        axes, len(maps), width=width, height=max(1.1, 0.8 * width), sharex=True, sharey=True
+    )
+    reach = 1.0
     for (name, map), column in zip(maps.items(), panels.T, strict=True):
-        basis = local_basis(map, demos.context(_keys(map))[rows], actuation)
-        reach = 1.1 * float(basis.abs().max())
+        basis = float(map.action_scale) * local_basis(map, demos.context(_keys(map))[rows], actuation)
+        reach = max(reach, float(basis.abs().max()))
         for entries, panel in zip(basis.unbind(-1), column[: map.action_dim], strict=True):
-            panel.plot(entries, linewidth=1.4)
-            panel.axhline(0, color="0.5", linewidth=0.7, zorder=1)
-            panel.set(ylim=(-reach, reach), xlim=(0, max(1, len(actuation) - 1)))
-        kind = "basis" if isinstance(map, nht.LinearActionMap) else "derivative by the action"
-        column[0].set_title(f"{name}: {kind}", fontsize=10)
+            for line, look in zip(entries.unbind(-1), looks(entries.shape[-1]), strict=True):
+                panel.plot(line, **look)
+            panel.axhline(0, color="0.5", linewidth=0.6, zorder=1)
+            panel.set_xlim(0, max(1, len(actuation) - 1))
+        kind = "basis" if isinstance(map, nht.LinearActionMap) else "derivative"
+        column[0].set_title(f"{name}: {kind}", loc="center")
         column[-1].set_xlabel("step")
+    panels[0, 0].set_ylim(-1.05 * reach, 1.05 * reach)
     motors = [f"motor {motor + 1}" for motor in range(actuation.shape[-1])]
-    columns = min(7, 2 * len(maps))  # as many as there is room for
-    figure.legend(panels[0, 0].lines[:-1], motors, loc="outside lower center", ncols=columns, frameon=False)
-    _save(figure, path)
+    columns = max(2, int(figure.get_figwidth() / 0.75))  # as many as there is room for
+    figure.legend(panels[0, 0].lines[:-1], motors, loc="outside lower center", ncols=min(7, columns))
+    save_figure(figure, path)
 
 
+@style()
 def tool_figure(
     maps: Mapping[str, nht.ActionMap], demos: nht.Demos, arm: nht.JacobianPinv, axes: int, path: str | Path
 ) -> None:
@@ -89,16 +95,19 @@ def tool_figure(
     rows = near_grid(position[:, :2])
     position = position[rows]
     jacobian = arm.jacobian(demos.data["joint_angle"][rows])[:, :3]
-    figure, panels = _panels(axes, len(maps), width=2.1, height=2.6, sharex=True, sharey=True)
+    width = min(1.3, (PAGE - 0.7) / len(maps))
+    figure, panels = _panels(
+        axes, len(maps), width=width, height=1.25 * width + 0.1, unit="\ny [m]", sharex=True, sharey=True
+    )
     for (name, map), column in zip(maps.items(), panels.T, strict=True):
         velocity = (jacobian @ axis_motion(map, demos.context(_keys(map))[rows]))[..., :axes]
         longest = float(velocity[:, :2].norm(dim=1).max())
         for moved, panel in zip(velocity.unbind(-1), column[: map.action_dim], strict=True):
             _quiver(panel, position, moved, longest)
         shown = "" if map.action_dim == axes else f" ({min(axes, map.action_dim)} of {map.action_dim} axes)"
-        column[0].set_title(name + shown, fontsize=10)
+        column[0].set_title(name + shown, loc="center", fontsize=8 if not shown or width > 1.1 else 6)
         column[-1].set_xlabel("x [m]")
-    share = min(0.9, 4.5 / figure.get_figwidth())  # of the width
+    share = min(0.9, 2.6 / figure.get_figwidth())  # of the width
     bar = figure.colorbar(
         ScalarMappable(STEEP, SLOPES),
         ax=figure.axes,
@@ -108,7 +117,7 @@ def tool_figure(
         extend="both",
     )
     bar.set_ticks([-0.1, 0, 0.1], labels=["10 % down", "level", "10 % up"])
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 @torch.no_grad()
@@ -160,7 +169,7 @@ def _quiver(panel: Axes, position: Tensor, velocity: Tensor, longest: float) -> 
     slope = velocity[:, 2] / velocity.norm(dim=1).clamp_min(1e-9)
     spread = float((position.amax(0) - position.amin(0)).max()) / GRID
     x, y = position[:, :2].mT
-    panel.scatter(x, y, c=slope, s=5, cmap=SLOPES, norm=STEEP)
+    panel.scatter(x, y, c=slope, s=1.5, linewidth=0, cmap=SLOPES, norm=STEEP)
     panel.quiver(
         *(x, y, *velocity[:, :2].mT, slope),
         cmap=SLOPES,
@@ -168,31 +177,30 @@ def _quiver(panel: Axes, position: Tensor, velocity: Tensor, longest: float) -> 
         angles="xy",
         scale_units="xy",
         scale=max(longest, 1e-9) / spread,
-        width=0.009,
+        width=0.012,
     )
     panel.set_aspect("equal")
     panel.margins(0.12)
 
 
 def _panels(
-    rows: int, columns: int, *, width: float, height: float, sharex: bool = False, sharey: bool = False
+    rows: int,
+    columns: int,
+    *,
+    width: float,
+    height: float,
+    unit: str = "",
+    sharex: bool = False,
+    sharey: bool = False,
 ) -> tuple[Figure, NDArray[np.object_]]:
     """A figure of ``(rows, columns)`` panels of a size [inch], a row for each action axis."""
-    size = (width * columns + 0.6, height * rows + 0.8)
+    size = (width * columns + 0.5, height * rows + 0.6)
     figure, panels = plt.subplots(
         rows, columns, figsize=size, layout="constrained", squeeze=False, sharex=sharex, sharey=sharey
     )
     for axis, panel in enumerate(panels[:, 0]):
-        panel.set_ylabel(f"axis {axis + 1}" + ("\ny [m]" if sharey else ""))
-    for panel in panels.flat:
-        panel.grid(alpha=0.25)
-        panel.set_axisbelow(True)
+        panel.set_ylabel(f"axis {axis + 1}{unit}")
     return figure, panels
-
-
-def _save(figure: Figure, path: str | Path) -> None:
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
 
 
 def _keys(map: nht.ActionMap) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -35,11 +35,13 @@ def trained_map(
     device: str = "cpu",
     *,
     align: str | None = None,
+    watch: Callable[[dict[str, float]], None] | None = None,
 ) -> nht.MapTraining:
     """Train the map that ``map`` describes; without a folder of demonstrations, the expert records some.
 
     With ``align="tool"`` its axes are then turned to the motion of the arm's tool: 1 is along +x, 2 along +y, 3 along
-    +z, on average over the demonstrations; 4, 5 and 6 turn it about x, y and z.
+    +z, on average over the demonstrations; 4, 5 and 6 turn it about x, y and z. ``watch`` is called with the metrics of
+    every validation.
 
     Raises:
         ValueError: for an unknown kind of map, or demonstrations of another task; for an alignment without a known
@@ -61,6 +63,8 @@ def trained_map(
             def show(metrics: dict[str, float]) -> None:
                 bar.set_postfix(error=f"{metrics['validation_error']:.2e}", refresh=False)
                 bar.update(int(metrics["step"]) - bar.n)
+                if watch is not None:
+                    watch(metrics)
 
             trained = nht.train_map(
                 data,

@@ -19,11 +19,12 @@ import nht
 from nht.recipes.agents.table import name_of
 from nht.recipes.maps.interface import run_map
 from nht.recipes.maps.kinds import default_scale, map_context_keys
-from nht.recipes.run.dashboard import Dashboard, open_dashboard, wanted
+from nht.recipes.run.charts import RunCharts
+from nht.recipes.run.dashboard import open_dashboard, wanted
 from nht.recipes.run.demonstrations import DEMOS_FOLDER, note_demos, provide_demos
 from nht.recipes.run.environments import check_env, mapped_env
 from nht.recipes.run.metrics import FRAMES, SECONDS, TESTED
-from nht.recipes.run.metrics_file import read_metrics
+from nht.recipes.run.metrics_file import append_row, metrics_table, read_metrics
 from nht.recipes.run.ownership import OwnedError, claimed, owner_of
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.same_run import check_same
@@ -76,7 +77,7 @@ class RunFolder:
         self._make_map = make_map
         self._started = time.perf_counter()
         self._open = ExitStack()
-        self._dashboard: Dashboard | None = None
+        self._charts: RunCharts | None = None
         self._noted: dict[str, float] = {}
         if ranks.first:
             with ExitStack() as undo:
@@ -113,7 +114,7 @@ class RunFolder:
         if not (recorded := self.path / DEMOS_FOLDER).exists():
             undo.callback(shutil.rmtree, recorded, ignore_errors=True)
         told = provide_demos(self.config, self.resuming)
-        if not (kept := self.path / MAP_FILE).exists():
+        if fresh := not (kept := self.path / MAP_FILE).exists():
             map, found = self._make_map(told, motors)
             mapped_env(self.config.env, map, seed=0, num_envs=1).close()  # whether it fits the task
             if found:
@@ -122,8 +123,17 @@ class RunFolder:
             self._noted = note_demos(self.config, map)
             nht.save_map(map, kept)
         else:
-            self._noted = note_demos(self.config, kept_map(self.path, self.config, allow=self._named()))
-        self._dashboard = open_dashboard(self.path, self._settings(), self.config.run)
+            map = kept_map(self.path, self.config, allow=self._named())
+            self._noted = note_demos(self.config, map)
+        self._open_charts(map, fresh)
+
+    def _open_charts(self, map: nht.ActionMap, fresh: bool) -> None:
+        """Begin the run on W&B, or go on with it; what it is made from is said where the map is ``fresh``."""
+        dashboard = open_dashboard(self.path, self._settings(), self.config.run)
+        if dashboard is not None:
+            self._charts = RunCharts(dashboard, self.path, self.config)
+            if fresh:
+                self._charts.show_origin(self.path / MAP_FILE, map, self.path / MAP_METRICS_FILE)
 
     def _look(self) -> None:
         """Find out whether there is a run to resume, and whether it may be resumed."""
@@ -181,8 +191,18 @@ class RunFolder:
         """The learners that got to the end, with their numbers."""
         return [(0, self)]
 
-    def log_each(self, frames: int, rows: Sequence[dict[str, float] | FloatingPointError]) -> None:
-        """Append the row of the only learner.
+    @property
+    def charted(self) -> bool:
+        """Whether this process shows the run on W&B."""
+        return self._charts is not None
+
+    def log_each(
+        self,
+        frames: int,
+        rows: Sequence[dict[str, float] | FloatingPointError],
+        latest: Sequence[dict[str, float]] = (),
+    ) -> None:
+        """Append the row of the only learner; ``latest`` is what W&B gets of training in place of its means.
 
         Raises:
             FloatingPointError: if an error is given in place of the row.
@@ -190,21 +210,30 @@ class RunFolder:
         (row,) = rows
         if isinstance(row, FloatingPointError):
             raise row
-        self.log(frames, row)
+        self.log(frames, row, *latest)
 
-    def log(self, frames: int, row: dict[str, float]) -> None:
+    def log(self, frames: int, row: dict[str, float], latest: dict[str, float] | None = None) -> None:
         """Append a row to ``metrics.csv`` and send it to W&B, against environment steps."""
         if not self._ranks.first:
             return
         row = {FRAMES: frames, **row, **self._noted, SECONDS: time.perf_counter() - self._started}
-        fresh = not self.metrics.exists()
-        with self.metrics.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(row))
-            if fresh:
-                writer.writeheader()
-            writer.writerow(row)
-        if self._dashboard is not None:
-            self._dashboard.log(frames, row)
+        append_row(self.metrics, row)
+        if self._charts is not None:
+            self._charts.row(frames, row, latest)
+
+    def chart_each(self, frames: int, rows: Sequence[dict[str, float]]) -> None:
+        """Chart a row between two tests, of the only learner."""
+        if self._charts is not None and rows[0]:
+            self._charts.row(frames, rows[0] | {SECONDS: time.perf_counter() - self._started})
+
+    def leave_out(self, seconds: float) -> None:
+        """Count a time as none of the run's: it went into films."""
+        self._started += seconds
+
+    def film(self, frames: int, video: Path) -> None:
+        """Show a film of the policy on W&B."""
+        if self._charts is not None:
+            self._charts.film(frames, video)
 
     def rewind(self, frames: int) -> None:
         """Drop rows after ``frames``, and rows that a kill cut short: a resumed run writes them again.
@@ -223,12 +252,12 @@ class RunFolder:
             csv.writer(file).writerows([heading, *kept])
 
     def finish(self, frames: int) -> None:
-        """Upload video and map to W&B, and mark the run as complete."""
+        """Finish the run on W&B, and mark it as complete."""
         if not self._ranks.first:
             return
-        if self._dashboard is not None:
-            self._dashboard.finish(self.path / MAP_FILE, self.path / VIDEO_FILE)
-            self._dashboard = None
+        if self._charts is not None:
+            self._charts.finish(frames, metrics_table(self.metrics))
+            self._charts = None
         with replacing(self.path / WHOLE_FILE) as scratch:
             scratch.write_text(json.dumps({FRAMES: frames}))
 
@@ -243,9 +272,9 @@ class RunFolder:
 
     def close(self) -> None:
         """Release the folder, and close W&B's run if it is incomplete."""
-        if self._dashboard is not None:
-            self._dashboard.leave()
-            self._dashboard = None
+        if self._charts is not None:
+            self._charts.leave()
+            self._charts = None
         self._open.close()
 
 

@@ -20,7 +20,18 @@ from nht.recipes.sections import Training
 
 Config = TypeVar("Config", bound=Training)
 
-OWN = ("seed", "map", "demos", "run.folder", "run.wandb_group", "run.wandb_job_type", "run.wandb_project")
+OWN = (
+    "seed",
+    "map",
+    "demos",
+    "run.folder",
+    "run.wandb_group",
+    "run.wandb_job_type",
+    "run.wandb_name",
+    "run.wandb_notes",
+    "run.wandb_project",
+    "run.wandb_tags",
+)
 """Settings that each learner has of its own, beside those that its algorithm lets vary."""
 
 

@@ -16,20 +16,19 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 
-from nht.recipes.agents.policy import load_policy, save_policy
+from nht.recipes.agents.policy import save_policy
 from nht.recipes.agents.stacking import of_learner
 from nht.recipes.run.checkpoints import Checkpoints
 from nht.recipes.run.collecting import CollectorState, batch_copies, make_collector
 from nht.recipes.run.environments import RunEnvs
-from nht.recipes.run.folder import VIDEO_FILE, RunFolder
+from nht.recipes.run.filming import Filming
+from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.learners import Learners
 from nht.recipes.run.population import PopulationFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.record import Record
-from nht.recipes.run.video import record_video
 from nht.recipes.run.workers import WorkerEndedError, Workers
 
-VIDEO_EPISODES = 3
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 """Signals that end a run, after a last checkpoint."""
 ECHO = 3.0
@@ -155,6 +154,8 @@ class Loop:
         common = set.intersection(*map(set, ranks.gather(self._checkpoints.steps())))
         if common:
             self._checkpoints.load(max(common))
+            if not (self._alone and self._envs.train.base_env.task.can_resume):
+                self._record.statistics.forget_episodes()  # they begin anew
         elif folder.config.run.resume is True:
             raise FileNotFoundError(f"{folder.path} holds no checkpoint to resume from.")
         folder.rewind(self._record.frames)
@@ -174,6 +175,7 @@ class Loop:
                 random = self._record.frames < self._random_frames  # the collector itself draws actions then
                 with self._drawing() if random else nullcontext():
                     batch = next(batches)
+                self._record.copies = self.batch_copies
                 yield batch
                 self._save_if_due()
             return
@@ -181,6 +183,7 @@ class Loop:
         while not self._record.finished:
             with self._saving():
                 batch = workers.next()
+            self._record.copies = self.batch_copies
             yield batch
             with self._saving():
                 workers.update(self._policy)
@@ -218,22 +221,14 @@ class Loop:
     def finish(self, policy: TensorDictModuleBase) -> None:
         """Save and film the policy of every learner, close everything, and print a summary."""
         folder = self._folder
+        filming = Filming(folder, self._ranks, self._envs)
         for learner, member in folder.finished():
             if self._ranks.first:
                 state = policy.state_dict()
                 many = len(folder.members) > 1
                 save_policy(of_learner(state, learner) if many else state, member.path)
-                if member.config.evaluation.video:
-                    self._film(member, policy)
+                filming.at_the_end(learner, member, policy, self._record.frames)
             member.finish(self._record.frames)
         folder.show()
         folder.close()
         self._ranks.part()
-
-    def _film(self, member: RunFolder, policy: TensorDictModuleBase) -> None:
-        env = self._envs.filmed(member.config, member.map, VIDEO_EPISODES)
-        shown = policy if len(self._folder.members) == 1 else load_policy(member.path, env, member.config)
-        try:
-            record_video(env, shown, member.path / VIDEO_FILE)
-        except RuntimeError as error:  # a machine without OpenGL trains all the same
-            print(f"no video: {error}")

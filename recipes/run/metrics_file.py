@@ -1,9 +1,10 @@
-"""Reads and checks ``metrics.csv`` of a run: a row for each evaluation, with growing numbers of steps."""
+"""Writes, reads and checks ``metrics.csv`` of a run: a row for each evaluation, with growing numbers of steps."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas
@@ -47,6 +48,18 @@ def metrics_table(file: Path) -> pandas.DataFrame:
     heading, rows = read_metrics(file)
     table = pandas.DataFrame(rows, columns=heading or [FRAMES]).astype(float)
     return table.astype({FRAMES: int})
+
+
+def append_row(file: Path, row: Mapping[str, float]) -> None:
+    """Append a row of metrics. A file of an earlier version keeps its columns: others are left out, missing are NaN."""
+    with file.open("a+", newline="") as opened:
+        opened.seek(0)
+        heading = next(csv.reader(opened), None)
+        opened.seek(0, io.SEEK_END)
+        writer = csv.DictWriter(opened, heading or list(row), restval="nan", extrasaction="ignore")
+        if heading is None:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 def _check_row(file: Path, number: int, heading: list[str], row: list[str]) -> None:

@@ -150,14 +150,28 @@ class PopulationFolder:
             member.whole for member in self.members
         )
 
-    def log_each(self, frames: int, rows: Sequence[Row | FloatingPointError]) -> None:
+    @property
+    def charted(self) -> bool:
+        """Whether any learner is shown on W&B."""
+        return any(member.charted for member in self.members)
+
+    def chart_each(self, frames: int, rows: Sequence[Row]) -> None:
+        """Chart a row between two tests, of every learner that goes on."""
+        for member, row in zip(self.members, rows, strict=True):
+            if diverged(member.path) is None and not member.whole:
+                member.chart_each(frames, [row])
+
+    def log_each(
+        self, frames: int, rows: Sequence[Row | FloatingPointError], latest: Sequence[Row] = ()
+    ) -> None:
         """Append a row to every learner's metrics; one that diverged is noted, and gets no more.
 
         Raises:
             FloatingPointError: if all have diverged.
         """
         going_on = 0
-        for member, row in zip(self.members, rows, strict=True):
+        charted: Sequence[Row | None] = latest or [None] * len(rows)
+        for member, row, chart in zip(self.members, rows, charted, strict=True):
             if diverged(member.path) is not None or member.whole:
                 going_on += member.whole
             elif isinstance(row, FloatingPointError):
@@ -165,7 +179,7 @@ class PopulationFolder:
                 with replacing(member.path / DIVERGED_FILE) as scratch:
                     scratch.write_text(json.dumps(note))
             else:
-                member.log(frames, row)
+                member.log(frames, row, chart)
                 going_on += 1
         if not going_on:
             raise FloatingPointError(

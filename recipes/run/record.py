@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pandas
@@ -12,15 +13,23 @@ from tqdm import tqdm
 from nht.recipes.progress_bar import progress_bar, show_beside
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.evaluation import Policy, evaluate
+from nht.recipes.run.filming import Filming
 from nht.recipes.run.folder import RunFolder
-from nht.recipes.run.metrics import RETURN, SUCCESS, UPDATES, tested
+from nht.recipes.run.metrics import (
+    FRAMES_PER_SECOND,
+    RETURN,
+    SUCCESS,
+    UPDATES,
+    UPDATES_PER_SECOND,
+    tested,
+)
 from nht.recipes.run.population import PopulationFolder
 from nht.recipes.run.ranks import Ranks
 from nht.recipes.run.statistics import Counters, TrainingStatistics
 
 
 class Record:
-    """Counts a run's steps and updates, and writes a row of metrics at every evaluation.
+    """Counts a run's steps and updates, and writes a row of metrics at every evaluation; W&B gets rows in between, too.
 
     Args:
         folder: where the rows go.
@@ -31,6 +40,8 @@ class Record:
     Attributes:
         counters: environment steps (of all processes) and gradient steps so far, of each learner.
         statistics: sums since the last row.
+        gradient_norms: gives more columns of every learner; none, unless a recipe sets it.
+        copies: the copies of this process that the latest batch comes from.
     """
 
     def __init__(
@@ -39,8 +50,14 @@ class Record:
         self._folder, self._ranks, self._envs = folder, ranks, envs
         self.counters = Counters()
         bounds = envs.train.base_env.action_spec.space
-        self.statistics = TrainingStatistics(bounds, losses, envs.learners)
+        self.statistics = TrainingStatistics(bounds, losses, envs.learners, envs.copies)
+        self.gradient_norms: Callable[[], Sequence[dict[str, float]]] = lambda: [{}] * (envs.learners or 1)
+        self.copies = slice(None)
         self._total, self._every = folder.config.algo.total_frames, folder.config.evaluation.every
+        self._charted_every = folder.config.charted_every
+        self._charted = ranks.any(folder.charted)  # in all processes, as they add up together
+        self._filming = Filming(folder, ranks, envs)
+        self._clock = Clock(self.counters)
         self._bar: tqdm[Any] | None = None
 
     @property
@@ -60,6 +77,7 @@ class Record:
 
     def show_progress(self) -> None:
         """Show the progress bar, starting from the current step."""
+        self._clock = Clock(self.counters)
         self._bar = progress_bar(
             self._total,
             self._folder.path.name,
@@ -70,11 +88,14 @@ class Record:
         )
 
     def count_steps(self, data: TensorDictBase) -> None:
-        """Count collected steps ``(copies, T)``, or ``(learners, copies, T)``."""
-        learners = self._envs.learners
+        """Count collected steps ``(copies, T)``, or ``(learners, copies, T)``; chart what came before if it is time."""
+        frames, learners = self.counters.frames, self._envs.learners
+        if self._charted and frames and frames % self._charted_every == 0 and not self.evaluation_due:
+            self._folder.chart_each(frames, self._latest())
         steps = data.numel() // (learners or 1) * self._ranks.size
         self.counters.frames += steps
         self.statistics.add_steps(data.reshape(-1) if learners is None else data.flatten(1, 2))
+        self.statistics.add_returns(data, self.copies)
         if self._bar is not None:
             self._bar.update(steps)
 
@@ -83,21 +104,35 @@ class Record:
         self.counters.updates += 1
         self.statistics.add_losses(losses)
 
+    def _latest(self) -> list[dict[str, float]]:
+        """What W&B gets of training since the last time, for every learner; nothing of one that diverged."""
+        rates = self._clock.rates()
+        found = zip(self.statistics.latest(self._ranks.sum), self.gradient_norms(), strict=True)
+        return [
+            {}
+            if isinstance(row, FloatingPointError)
+            else row | norms | rates | {UPDATES: self.counters.updates}
+            for row, norms in found
+        ]
+
     def evaluate(self, policy: Policy) -> None:
         """Test the policy, and write a row of metrics: the training of all processes since the last one, and the test.
 
         Raises:
             FloatingPointError: if training has diverged, that of all learners.
         """
+        latest = self._latest() if self._charted else []
         outcomes = evaluate(self._envs.final_test if self.finished else self._envs.test, policy).each()
         trained = self.statistics.take(self._ranks.sum)
         rows = [
             found
             if isinstance(found, FloatingPointError)
-            else found | outcome.metrics() | {UPDATES: self.counters.updates}
-            for found, outcome in zip(trained, outcomes, strict=True)
+            else found | norms | outcome.metrics() | {UPDATES: self.counters.updates}
+            for found, norms, outcome in zip(trained, self.gradient_norms(), outcomes, strict=True)
         ]
-        self._folder.log_each(self.counters.frames, rows)
+        self._folder.log_each(self.counters.frames, rows, latest)
+        self._filming.on_the_way(policy, self.counters.frames)
+        self._clock.start()
         if self._bar is not None:
             means = pandas.DataFrame([row for row in rows if isinstance(row, dict)]).mean()
             shown = {RETURN: means[tested(RETURN)]}
@@ -109,3 +144,30 @@ class Record:
         """Close the progress bar."""
         if self._bar is not None:
             self._bar.close()
+
+
+class Clock:
+    """How fast training goes on, tests left out.
+
+    Args:
+        counters: of the run.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self.start()
+
+    def start(self) -> None:
+        """Count from now on."""
+        self._since = time.perf_counter()
+        self._frames, self._updates = self._counters.frames, self._counters.updates
+
+    def rates(self) -> dict[str, float]:
+        """Environment steps and gradient steps a second since the last time."""
+        seconds = max(time.perf_counter() - self._since, 1e-9)
+        rates = {
+            FRAMES_PER_SECOND: (self._counters.frames - self._frames) / seconds,
+            UPDATES_PER_SECOND: (self._counters.updates - self._updates) / seconds,
+        }
+        self.start()
+        return rates

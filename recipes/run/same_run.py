@@ -13,6 +13,7 @@ TAKEN = (
     "algo.total_frames",
     "evaluation.every",
     "evaluation.video",
+    "evaluation.video_every",
     "env.num_threads",
     "device",
     "torch_threads",

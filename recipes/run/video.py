@@ -1,8 +1,9 @@
-"""Films of test episodes: a grid of copies with the tool's trail and the outcome of each."""
+"""Films of test episodes: a grid of copies with the tool's trail and the outcome of each, and contact sheets."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ PRESET = "veryfast"  # of x264; its own choice takes three times as long for a f
 GAP = 40  # grey of a tile without a copy
 COLOURS = {"failed": (200, 40, 40), "success": (30, 150, 60), "": (120, 120, 120)}
 BORDER = 4  # pixels
+FONT, MARGIN = 18, (12, 10)  # of what is written into a tile [pixel]
+STATE_FONT, STATE_HEIGHT = 15, 22  # and on a contact sheet, at half the size
 
 
 def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
@@ -61,31 +64,63 @@ def record_video(env: TransformedEnv, policy: Policy, path: Path) -> Evaluation:
             outcome = evaluate(env, policy, on_step=watch)
     finally:
         film.close()
+    write_film(path, film.frames, film.frames_per_second)
+    imageio.imwrite(path.with_suffix(".png"), contact_sheet(film.frames, film.states))
+    return outcome
+
+
+def write_film(path: Path, frames: list[list[Picture]], frames_per_second: float) -> None:
+    """Write moments, each with a picture of every copy, as an MP4."""
     options: dict[str, Any] = {
-        "fps": film.frames_per_second,
+        "fps": frames_per_second,
         "macro_block_size": 8,
         "ffmpeg_params": ["-preset", PRESET],
     }
     with imageio.get_writer(path, **options) as writer:
         video: Any = writer  # its stub lacks append_data
-        for tiles in film.frames:
+        for tiles in frames:
             video.append_data(grid(tiles))
-    imageio.imwrite(path.with_suffix(".png"), contact_sheet(film.frames))
-    return outcome
+
+
+@dataclass(frozen=True)
+class State:
+    """What is said of a copy at a moment.
+
+    Attributes:
+        seconds: since its episode began.
+        outcome: ``success``, ``failed``, or nothing yet.
+        name: of the copy, if it has one.
+    """
+
+    seconds: float
+    outcome: str = ""
+    name: str = ""
+
+    def told(self, digits: int = 1, *more: str) -> str:
+        """All that in a line, with ``more`` behind the time."""
+        parts = (self.name, f"{self.seconds:.{digits}f} s", *more, self.outcome)
+        return "  ".join(part for part in parts if part)
 
 
 class Film:
     """Takes pictures of all copies of a task, step by step.
 
+    Args:
+        task: what to film.
+        name: to write into each picture.
+
     Attributes:
         frames: of every moment filmed, a picture ``(height, width, 3)`` per copy.
+        states: of every moment filmed, how each copy stands.
         frames_per_second: at which the film runs at ``speed``.
         speed: as a multiple of real time.
         steps: largest number of steps that are added, the reset included.
     """
 
-    def __init__(self, task: Simulation) -> None:
+    def __init__(self, task: Simulation, name: str = "") -> None:
         self.frames: list[list[Picture]] = []
+        self.states: list[list[State]] = []
+        self._name = name
         steps_per_second = 1 / task.time_per_step
         smooth = math.ceil(steps_per_second / SMOOTH)
         self.steps = task.max_episode_steps + 1
@@ -106,26 +141,31 @@ class Film:
         if (tool := outcome.get("tool_position", None)) is not None:
             self._trail.append(tool.double().numpy())
         if self._steps % self._every == 0 or (done & self._running).any():
-            self.frames.append([self._tile(row, success[row], failure[row]) for row in range(len(done))])
+            states = [self._state(row, success[row], failure[row]) for row in range(len(done))]
+            self.frames.append([self._tile(row, state) for row, state in enumerate(states)])
+            self.states.append(states)
         self._running &= ~done
         self._steps += 1
 
-    def _tile(self, row: int, success: bool, failure: bool) -> Picture:
+    def _state(self, row: int, success: bool, failure: bool) -> State:
+        if not self._running[row]:
+            return self.states[-1][row]
+        outcome = "failed" if failure else "success" if success else ""
+        return State(self._steps * self._seconds_per_step, outcome, self._name)
+
+    def _tile(self, row: int, state: State) -> Picture:
         if not self._running[row]:
             return self.frames[-1][row]
         trail = np.stack([points[row] for points in self._trail[::TRAIL_EVERY]]) if self._trail else None
-        state = "failed" if failure else "success" if success else ""
         picture = Image.fromarray(self._renderer.frame(row, trail))
-        seconds = self._steps * self._seconds_per_step
-        draw = ImageDraw.Draw(picture)
-        draw.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=COLOURS[state], width=BORDER)
-        draw.text(
-            (12, 10),
-            f"{seconds:4.2f} s  {f'{self.speed} x  ' if self.speed > 1 else ''}{state}",
+        frame(picture, state.outcome)
+        ImageDraw.Draw(picture).text(
+            MARGIN,
+            state.told(2, f"{self.speed} x" * (self.speed > 1)),
             fill=(255, 255, 255),
             stroke_width=2,
             stroke_fill=(0, 0, 0),
-            font_size=18,
+            font_size=FONT,
         )
         return np.asarray(picture)
 
@@ -134,17 +174,50 @@ class Film:
         self._renderer.close()
 
 
+def frame(picture: Image.Image, outcome: str) -> None:
+    """Draw a border in the colour of an outcome."""
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=COLOURS[outcome], width=BORDER)
+
+
 def grid(tiles: list[Picture]) -> Picture:
     """Pictures of one size side by side, in about as many rows as columns; dark where there is none left."""
-    columns = math.ceil(math.sqrt(len(tiles)))
+    columns = grid_columns(len(tiles))
     missing = -len(tiles) % columns
     tiles = tiles + [np.full_like(tiles[0], GAP)] * missing
     rows = [np.concatenate(tiles[start : start + columns], axis=1) for start in range(0, len(tiles), columns)]
     return np.concatenate(rows, axis=0)
 
 
-def contact_sheet(frames: list[list[Picture]]) -> Picture:
-    """One row per copy: pictures of its film from start to end, at half size."""
+def grid_columns(count: int) -> int:
+    """Columns of a grid: about as many as rows, or one or two more if that leaves fewer gaps. Three lie in one row."""
+    square = math.ceil(math.sqrt(count))
+    return min(range(square, max(3, square + 1) + 1), key=lambda columns: (-count % columns, columns))
+
+
+def contact_sheet(frames: list[list[Picture]], states: list[list[State]] | None = None) -> Picture:
+    """One row per copy: pictures of its film from start to end, at half size.
+
+    Args:
+        frames: of every moment, a picture of each copy.
+        states: how the copies stand then, which is written anew in a size that can be read; None leaves the pictures.
+    """
     moments = np.linspace(0, len(frames) - 1, SHEET_COLUMNS).round().astype(int)
-    columns = [np.concatenate([tile[::2, ::2] for tile in frames[moment]], axis=0) for moment in moments]
+    columns = []
+    for moment in moments:
+        tiles = [tile[::2, ::2] for tile in frames[moment]]
+        if states is not None:
+            tiles = [_stated(tile, state) for tile, state in zip(tiles, states[moment], strict=True)]
+        columns.append(np.concatenate(tiles, axis=0))
     return np.concatenate(columns, axis=1)
+
+
+def _stated(tile: Picture, state: State) -> Picture:
+    """A small picture with a bar that says how the copy stands."""
+    picture = Image.fromarray(tile)
+    draw = ImageDraw.Draw(picture)
+    bar = (0, 0, picture.width - 1, STATE_HEIGHT)
+    draw.rectangle(bar, fill=COLOURS[state.outcome] if state.outcome else (60, 60, 60))
+    draw.text((BORDER + 4, 2), state.told(), fill=(255, 255, 255), font_size=STATE_FONT)
+    frame(picture, state.outcome)
+    return np.asarray(picture)

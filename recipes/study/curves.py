@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")  # no display is needed
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas
 
+from nht.recipes.figure_style import PAGE, PANEL_SHAPE, label_ends, save_figure, style, thousands
 from nht.recipes.run.config_file import read_settings
 from nht.recipes.run.folder import METRICS_FILE
 from nht.recipes.run.metrics import FAILURE, FRAMES, SECONDS, SUCCESS, tested
@@ -21,13 +18,16 @@ from nht.recipes.run.saved_run import CONFIG_FILE, OLDEST_ALGORITHM
 from nht.recipes.study.figures import colour
 from nht.recipes.study.scores import interquartile_mean, interval
 
+MARKED = 40
+"""Evaluations up to which each has a dot."""
 LABELS = ("task", "algorithm", "interface", "seed")
 """Columns that identify the run of an evaluation."""
 
 
 def read_runs(folders: list[Path]) -> pandas.DataFrame:
-    """The evaluations of all runs in or below ``folders``, a row each, with ``LABELS``.
+    """The evaluations of all runs in or below ``folders``, a row each, with ``LABELS`` and the ``run``.
 
+    That is its number among ``run_folders``.
     An interface's name includes its number of actions if there are runs with several. Nothing that a run's
     configuration names is imported.
 
@@ -35,10 +35,13 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
         FileNotFoundError: if there is no run with an evaluation.
         ValueError: if a run's files cannot be read.
     """
-    metrics = sorted({path for folder in folders for path in folder.rglob(METRICS_FILE)})
-    if not metrics:
+    runs = run_folders(folders)
+    if not runs:
         raise FileNotFoundError(f"no {METRICS_FILE} in or below {[str(folder) for folder in folders]}.")
-    curves = pandas.concat([_read_run(path) for path in metrics], ignore_index=True)
+    curves = pandas.concat(
+        [_read_run(folder / METRICS_FILE).assign(run=number) for number, folder in enumerate(runs)],
+        ignore_index=True,
+    )
     if curves.empty or tested(SUCCESS) not in curves:
         raise FileNotFoundError(
             f"no run in or below {[str(folder) for folder in folders]} has an evaluation yet."
@@ -46,6 +49,11 @@ def read_runs(folders: list[Path]) -> pandas.DataFrame:
     widths = curves.groupby(["task", "interface"])["action_dim"].transform("nunique")
     named = curves["interface"] + " (k = " + curves["action_dim"].astype(str) + ")"
     return curves.assign(interface=curves["interface"].where(widths == 1, named)).drop(columns="action_dim")
+
+
+def run_folders(folders: list[Path]) -> list[Path]:
+    """The folders of all runs in or below ``folders``."""
+    return sorted({path.parent for folder in folders for path in folder.rglob(METRICS_FILE)})
 
 
 def _read_run(metrics: Path) -> pandas.DataFrame:
@@ -116,21 +124,26 @@ def reached_by_all(group: pandas.DataFrame) -> pandas.DataFrame:
 
 
 def plot(curves: pandas.DataFrame, metric: str, title: str, path: Path, lines: str = "interface") -> None:
-    """Plot the mean over seeds of every interface or algorithm, with its interval, against environment steps."""
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for name, group in curves.groupby(lines, sort=False):
-        by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]
-        frames = np.array(list(by_frames.groups))
-        bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
-        seeds = group["seed"].nunique()
-        label = f"{name} ({seeds} seed{'s' if seeds > 1 else ''})"
-        (line,) = axes.plot(frames, by_frames.mean(), label=label, color=colour(str(name).partition(" (")[0]))
-        axes.fill_between(frames, bands[:, 0], bands[:, 1], color=line.get_color(), alpha=0.2, linewidth=0)
-    axes.set(xlabel="environment steps", ylabel=f"{metric} of test episodes", title=title)
-    if metric == SUCCESS:
-        axes.set(ylim=(-0.03, 1.03))
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:.0f}k")
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    """Plot the mean over seeds of every interface or algorithm, with its interval, against environment steps.
+
+    The axis begins at 0, a dot is an evaluation, and each line has its name at its end. A PDF lies beside the PNG.
+    """
+    with style():
+        width = 0.75 * PAGE
+        figure, axes = plt.subplots(figsize=(width, width * PANEL_SHAPE / 1.2), layout="constrained")
+        for name, group in curves.groupby(lines, sort=False):
+            by_frames = reached_by_all(group).groupby(FRAMES)[tested(metric)]
+            frames = np.array(list(by_frames.groups))
+            bands = np.array([interval(scores.to_numpy()) for _, scores in by_frames])
+            seeds = group["seed"].nunique()
+            label = f"{name} ({seeds} seed{'s' if seeds > 1 else ''})"
+            marker = "o" if len(frames) <= MARKED else ""
+            shade = colour(str(name).partition(" (")[0])
+            axes.plot(frames, by_frames.mean(), marker=marker, markersize=2, label=label, color=shade)
+            axes.fill_between(frames, bands[:, 0], bands[:, 1], color=shade, alpha=0.2, linewidth=0)
+        axes.set(xlabel="environment steps", ylabel=f"{metric} of test episodes", title=title)
+        if metric == SUCCESS:
+            axes.set(ylim=(-0.03, 1.03))
+        thousands(axes)
+        label_ends(axes)
+        save_figure(figure, path)

@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from nht.recipes.run.metrics import EVERY_RUN
 from nht.recipes.run.metrics_file import metrics_table
 from nht.recipes.run.ownership import OwnedError, claimed
 from nht.recipes.run.workers import WorkerEndedError
+from nht.recipes.study.dashboard_names import names_of
 from nht.recipes.study.rows_file import CORE_SECONDS, MAP_ERROR
 from nht.recipes.study.space import VERSION, Value
 from nht.writing import replacing
@@ -138,7 +139,7 @@ def run_job(job: Job, folder: Path) -> Ending | None:
         if (outcome := Ending.read(run)) is None:  # another process may have ended it in the meantime
             begun = time.process_time()
             try:
-                outcome = _train(job, run)
+                outcome = _train(job, run, names_of(job, folder))
             except OwnedError:
                 return None
             outcome = replace(outcome, core_seconds=time.process_time() - begun)
@@ -148,11 +149,11 @@ def run_job(job: Job, folder: Path) -> Ending | None:
     return outcome
 
 
-def _train(job: Job, run: Path) -> Ending:
+def _train(job: Job, run: Path, names: Sequence[str]) -> Ending:
     """Train, and return the outcome; raises OwnedError if another process writes the folder."""
     run.mkdir(parents=True, exist_ok=True)
     algorithm = find_algorithm(job.recipe)
-    overrides = [*job.overrides, f"run.folder={run}", "run.resume=auto"]
+    overrides = [*job.overrides, *names, f"run.folder={run}", "run.resume=auto"]
     with (
         (run / "train.log").open("a") as log,
         contextlib.redirect_stdout(log),

@@ -18,6 +18,7 @@ from nht.recipes.maps.kinds import find_kind
 from nht.recipes.quiet import quiet_libraries
 from nht.recipes.run.ownership import OwnedError, claimed
 from nht.recipes.run.population import diverged
+from nht.recipes.study.dashboard_names import names_of
 from nht.recipes.study.jobs import Ending, Job, run_job
 from nht.writing import replacing
 
@@ -140,7 +141,7 @@ def _train_together(jobs: Sequence[Job], folder: Path, together: Path) -> dict[s
         configure(
             algorithm.schema,
             job.recipe,
-            [*job.overrides, f"run.folder={folder / job.name}", "run.resume=auto"],
+            [*job.overrides, *names_of(job, folder), f"run.folder={folder / job.name}", "run.resume=auto"],
         )
         for job in jobs
     ]

@@ -81,7 +81,7 @@ def make_job(
     overrides += [] if kind_of(interface).fixed_width else [f"map.action_dim={search.action_dim}"]
     overrides += [f"demos.path={demos}", *search.base, *(f"{name}={value}" for name, value in told.items())]
     overrides += [f"seed={seed}", f"algo.total_frames={frames}"]
-    overrides += [f"run.wandb_group={stage}-{configuration:03d}", f"run.wandb_job_type={interface}"]
+    overrides += [f"run.wandb_job_type={interface}"]
     return Job(
         stage=stage,
         env=search.env,

@@ -67,10 +67,11 @@ assert configure(DDPG, "ddpg", ["env=six_reach_wide"]).env.options == {"radius":
 collect_demos.main(configure(CollectDemos, "collect_demos", ["env=six_reach", "demos.transitions=600", "out=demos"]))
 demos = nht.load_demos("demos", env="six_reach")
 assert demos.manifest["expert"] == "ReachExpert" and bool(demos.data["success"][-1])
-train = ["env=six_reach", "map=two_sided", "map.args={size: 0.5}", "demos.path=demos", "map.max_steps=250"]
+train = ["env=six_reach", "run.wandb=false", "map=two_sided", "map.args={size: 0.5}", "demos.path=demos"]
+train += ["map.max_steps=250"]
 train_map.main(configure(TrainMap, "train_map", [*train, "out=map.safetensors"]))
 try:
-    train_map.main(configure(TrainMap, "train_map", [*train[:2], "demos.path=demos", "map.args={sise: 0.5}", "out=x"]))
+    train_map.main(configure(TrainMap, "train_map", [*train[:3], "demos.path=demos", "map.args={sise: 0.5}", "out=x"]))
 except ValueError as error:
     assert "map.args ['sise'] are not arguments of 'two_sided'" in str(error), error
 map = nht.load_map("map.safetensors", allow=("six_joints",))
@@ -84,8 +85,9 @@ held = find_algorithm("held_ddpg")
 held.train(configure(held.schema, "held_ddpg", [*tiny, "map=none", "run.folder=held"]))
 for run in ("run", "held"):
     evaluate.main(configure(Evaluate, "evaluate", [f"run={run}", "episodes=3", "video=false"]))
-report.main(configure(Report, "report", ["runs=[run,held]", "out=report"]))
-compare = ["env=six_reach", "demos.path=demos", "maps=[two_sided,svd]", "action_dims=[2]", "map.max_steps=250"]
+report.main(configure(Report, "report", ["run.wandb=false", "video=false", "runs=[run,held]", "out=report"]))
+compare = ["run.wandb=false", "env=six_reach", "demos.path=demos", "maps=[two_sided,svd]", "action_dims=[2]"]
+compare += ["map.max_steps=250"]
 compare_maps.main(configure(CompareMaps, "compare_maps", [*compare, "out=compared"]))
 env = gymnasium.make("nht.envs:nht/SixReach-v0")
 env.reset(seed=0)
@@ -111,5 +113,5 @@ def test_the_command_line_and_a_search(python):
     base = "search.base=[" + ",".join([*TINY[2:3], *TINY[4:], "map.max_steps=250"]) + "]"
     more = ["search.interfaces=[two_sided,raw]", "search.total_frames=400", "search.best_frames=400"]
     python("-m", "nht.recipes.search", *search, base, *more, "demos.path=shared", "folder=searched")
-    python("-m", "nht.recipes.report", "searched")
+    python("-m", "nht.recipes.report", "searched", "run.wandb=false", "video=false")
     assert "| two_sided |" in (python.work / "searched" / "report" / "report.md").read_text()

@@ -1,5 +1,6 @@
 """Maps side by side: what the table holds, what the figures show."""
 
+import json
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import nht
+import wandb_file
 from nht.recipes import collect_demos, compare_maps
 from nht.recipes.config import CollectDemos, CompareMaps
 from nht.recipes.launch import configure
@@ -38,7 +40,11 @@ def compared(common: list[str], tmp_path_factory: pytest.TempPathFactory) -> Pat
     out = tmp_path_factory.mktemp("compared") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare_maps, "LATENCY_SECONDS", 0.01)
-        compare_maps.main(configure(CompareMaps, "compare_maps", [*common, f"out={out}", f"maps={KINDS}"]))
+        compare_maps.main(
+            configure(
+                CompareMaps, "compare_maps", ["run.wandb=false", *common, f"out={out}", f"maps={KINDS}"]
+            )
+        )
     return out
 
 
@@ -114,7 +120,7 @@ def test_the_figures_draw_what_the_maps_do(
     compared: Path, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr(map_figures, "_save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(map_figures, "save_figure", lambda figure, path: drawn.append(figure))
     data = nht.load_demos(demos)
     maps = {file.stem: nht.load_map(file) for file in sorted((compared / "maps").iterdir())}
     wanted = {name: maps[name] for name in ("svd-k2", "jacobian-k6")}
@@ -132,19 +138,45 @@ def test_the_figures_draw_what_the_maps_do(
     assert (np.abs(along_y.U) < 0.1 * along_y.V).all()
 
 
+def test_the_comparison_stands_on_the_dashboard(
+    common: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compare_maps, "LATENCY_SECONDS", 0.01)
+    out = tmp_path / "out"
+    compare_maps.main(
+        configure(CompareMaps, "compare_maps", [*common, f"out={out}", "maps=[svd,none]", "action_dims=[2]"])
+    )
+    found = wandb_file.read_run(out)
+    logged = {name for row in found.rows for name in row}
+    assert {"maps", "figures/error", "figures/basis", "figures/tool"} <= logged
+    table = json.loads(next((out / "wandb").rglob("*.table.json")).read_text())
+    assert [row[:2] for row in table["data"]] == [["svd", 2], ["none", 7]]
+    handed = {
+        name: set(files.aliases) for name, files in found.artifacts.items() if not files.use_after_commit
+    }
+    assert [aliases for name, aliases in handed.items() if name.startswith("map-k2-")] == [{"latest", "best"}]
+    assert [name.split("-")[0] for name, files in found.artifacts.items() if files.use_after_commit] == [
+        "demos"
+    ]
+
+
 # Bad input.
 
 
 def test_nothing_is_overwritten_or_guessed(compared: Path, common: list[str]) -> None:
     with pytest.raises(FileExistsError, match="never overwritten"):
-        compare_maps.main(configure(CompareMaps, "compare_maps", [*common, f"out={compared}"]))
+        compare_maps.main(
+            configure(CompareMaps, "compare_maps", ["run.wandb=false", *common, f"out={compared}"])
+        )
     for override, message in (
         ("maps=[nht,pca]", r"unknown map kind 'pca': choose from \['cae', "),
         ("maps=[]", r"nothing to compare: got maps=\[\]"),
         ("demos.path=null", r"demos.path must name the demonstrations"),
     ):
         with pytest.raises(ValueError, match=message):
-            compare_maps.main(configure(CompareMaps, "compare_maps", [*common, "out=unused", override]))
+            compare_maps.main(
+                configure(CompareMaps, "compare_maps", ["run.wandb=false", *common, "out=unused", override])
+            )
 
 
 def test_figures_of_what_is_not_there(demos: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import logging
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -34,8 +35,62 @@ def test_a_log_file_gets_the_start_and_the_end(monkeypatch):
     bar, text = drawn(monkeypatch, io.StringIO())
     assert bar.mininterval == bar.maxinterval == LOG
     assert text.count("steps:") == 2
-    assert "1000/1000" in text
+    assert "1000 of 1000" in text
     assert "error=0.5" in text
+
+
+def test_a_log_file_gets_lines_without_what_moves_a_cursor(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with progress_bar(10, "outer", "step") as outer:
+        outer.update(3)
+        with progress_bar(4, "inner", "step") as inner:
+            inner.update(4)
+        outer.update(7)
+    text = sys.stderr.getvalue()
+    assert not re.search("[\r\x1b]", text)
+    assert [line.split(",")[0] for line in text.splitlines()] == [
+        "outer:   0 %",
+        "inner:   0 %",
+        "inner: 100 %",
+        "outer: 100 %",
+    ]
+    assert "10 of 10 [" in text
+
+
+def test_a_log_file_gets_a_line_a_minute(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with progress_bar(10_000, "steps", "step") as bar:
+        for _ in range(600):
+            now[0] += 1.0
+            bar.update()
+    assert 9 <= len(sys.stderr.getvalue().splitlines()) <= 12  # of ten minutes
+
+
+def test_the_messages_of_torchrl_do_not_reach_whoever_calls_a_recipe(tmp_path):
+    """Not even without the command line, which sets filters."""
+    code = f"""
+import sys, warnings
+from pathlib import Path
+sys.path.insert(0, {str(Path(fresh_process.__file__).parent)!r})
+warnings.simplefilter("always")
+import nht, tiny_runs
+from nht.recipes import collect_demos, train_map
+from nht.recipes.config import CollectDemos, TrainMap
+from nht.recipes.launch import configure
+folder = Path({str(tmp_path)!r})
+tiny_runs.train("ddpg", folder / "run", "algo.total_frames=200", "evaluation.every=200")
+collect_demos.main(configure(CollectDemos, "collect_demos", [f"out={{folder / 'demos'}}", "demos.transitions=500"]))
+told = [f"demos.path={{folder / 'demos'}}", f"out={{folder / 'map.safetensors'}}", "map.max_steps=5", "run.wandb=false"]
+train_map.main(configure(TrainMap, "train_map", told))
+"""
+    done = fresh_process.run(code)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout + done.stderr
+    assert "saved in" in said
+    assert "Initialized" not in said
+    assert "target network" not in said
 
 
 def test_a_terminal_sees_every_word_at_once(monkeypatch):

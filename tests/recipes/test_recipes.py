@@ -1,5 +1,6 @@
 """The recipes end to end, a few steps each: what they write, that seeds act, that resuming changes nothing."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 import nht
+import wandb_file
 from nht.lipschitz import LipschitzProjection
 from nht.recipes import collect_demos, ddpg, evaluate, report, train_map
 from nht.recipes.config import DDPG, CollectDemos, Evaluate, Report, TrainMap
@@ -34,6 +36,8 @@ TINY = [
     "run.wandb=false",
 ]
 
+PLAIN = ["run.wandb=false", "video=false"]
+
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
@@ -48,7 +52,7 @@ def demos(tmp_path_factory):
 def map_file(demos, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "nht.safetensors"
     overrides = [f"demos.path={demos}", f"out={path}", "map.max_steps=500", "map.hidden=[32]"]
-    train_map.main(configure(TrainMap, "train_map", overrides))
+    train_map.main(configure(TrainMap, "train_map", ["run.wandb=false", *overrides, "run.wandb=false"]))
     return path
 
 
@@ -131,7 +135,7 @@ def test_the_papers_settings_run(map_file, tmp_path):
 
 def test_any_map_can_have_corrections(demos, map_file, tmp_path):
     overrides = ["map=svd", "map.residual=0.1", f"demos.path={demos}", f"out={tmp_path / 'svd'}"]
-    train_map.main(configure(TrainMap, "train_map", overrides))
+    train_map.main(configure(TrainMap, "train_map", ["run.wandb=false", *overrides, "run.wandb=false"]))
     saved = map_from_file(MapConfig("svd", str(tmp_path / "svd"), residual=0.1))
     assert (saved.action_dim, saved.scale) == (9, 0.1)
     train(tmp_path / "run", map_file, "map.residual=0.2", "algo.total_frames=1000")  # around a map without
@@ -176,7 +180,19 @@ def test_report_compares_the_runs_below_a_folder(run, map_file, tmp_path):
     shutil.copytree(folder, tmp_path / "runs" / "first")
     train(tmp_path / "runs" / "second", map_file, "seed=1")
     out = tmp_path / "report"
-    report.main(configure(Report, "report", [f"runs=[{tmp_path / 'runs'}]", f"out={out}", "title=Two seeds"]))
+    report.main(
+        configure(
+            Report,
+            "report",
+            [
+                "run.wandb=false",
+                "video=false",
+                f"runs=[{tmp_path / 'runs'}]",
+                f"out={out}",
+                "title=Two seeds",
+            ],
+        )
+    )
     curves = pandas.read_csv(out / "curves.csv")
     assert sorted(curves["seed"].unique()) == [0, 1]
     assert curves[curves["seed"] == 0]["eval_success"].tolist() == metrics["eval_success"].tolist()
@@ -196,7 +212,13 @@ def test_report_stops_where_a_seed_does():
 def test_report_of_returns(run, tmp_path):
     folder, metrics = run
     out = tmp_path / "report"
-    report.main(configure(Report, "report", [f"runs=[{folder}]", f"out={out}", "metric=return"]))
+    report.main(
+        configure(
+            Report,
+            "report",
+            [*PLAIN, f"runs=[{folder}]", f"out={out}", "metric=return"],
+        )
+    )
     last = f"{metrics['eval_return'].iloc[-1]:,.0f}"
     assert f"| nht | 1 | 2000 | {last} | {last} .. {last} | {last} |" in (out / "return-table.md").read_text()
     assert iio.imread(out / "return.png").ndim == 3
@@ -242,7 +264,9 @@ def test_demonstrations_and_maps_are_never_overwritten(demos, map_file):
     with pytest.raises(FileExistsError, match=r"never overwritten"):
         collect_demos.main(configure(CollectDemos, "collect_demos", [f"out={demos}"]))
     with pytest.raises(FileExistsError, match=r"never overwritten"):
-        train_map.main(configure(TrainMap, "train_map", [f"demos.path={demos}", f"out={map_file}"]))
+        train_map.main(
+            configure(TrainMap, "train_map", ["run.wandb=false", f"demos.path={demos}", f"out={map_file}"])
+        )
 
 
 def test_a_context_key_that_the_environment_lacks(map_file, tmp_path):
@@ -268,7 +292,11 @@ def test_demonstrations_of_another_env(demos, tmp_path):
     found = nht.load_demos(demos)
     nht.save_demos(found.data, tmp_path / "demos", env="cheetah", seed=0, expert="unknown")
     with pytest.raises(ValueError, match=r"of env 'cheetah', expected 'wam_wipe'"):
-        train_map.main(configure(TrainMap, "train_map", [f"demos.path={tmp_path / 'demos'}", "out=unused"]))
+        train_map.main(
+            configure(
+                TrainMap, "train_map", ["run.wandb=false", f"demos.path={tmp_path / 'demos'}", "out=unused"]
+            )
+        )
 
 
 def test_a_jacobian_without_an_arm():
@@ -325,4 +353,38 @@ def test_evaluating_what_is_no_run(tmp_path):
 
 def test_reporting_where_there_is_no_run(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no metrics.csv in or below"):
-        report.main(configure(Report, "report", [f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"]))
+        report.main(
+            configure(
+                Report,
+                "report",
+                [*PLAIN, f"runs=[{tmp_path}]", f"out={tmp_path / 'out'}"],
+            )
+        )
+
+
+def test_the_training_of_a_map_stands_on_the_dashboard_with_what_it_was_made_from(demos, tmp_path):
+    out = tmp_path / "maps" / "small.safetensors"
+    told = [f"demos.path={demos}", f"out={out}", "map.max_steps=600", "map.hidden=[8]", "seed=2"]
+    train_map.main(configure(TrainMap, "train_map", told))
+    found = wandb_file.read_run(out.parent)
+    assert (found.run.display_name, found.run.job_type, found.exit_code) == ("small", "train_map", 0)
+    assert found.config["map"]["max_steps"] == 600
+    errors = [row["map/validation_error"] for row in found.rows if "map/validation_error" in row]
+    assert len(errors) > 1
+    assert found.metrics["map/*"].step_metric == "map_steps"
+    fingerprint = nht.load_demos(demos).fingerprint[:8]
+    demonstrations = found.artifacts[f"demos-wam_wipe-{fingerprint}"]
+    map = found.artifacts[f"map-k2-{fingerprint}"]
+    assert (demonstrations.type, demonstrations.use_after_commit) == ("demonstrations", True)
+    assert (map.type, map.use_after_commit) == ("action-map", False)
+    metadata = json.loads(map.metadata)
+    assert metadata["class"] == "NHT"
+    assert metadata["validation_error"] == found.summary["map/validation_error"]
+    assert [content.path for content in demonstrations.manifest.contents] == ["manifest.json"]
+
+
+def test_a_training_of_a_map_that_fails_is_closed_as_failed(demos, tmp_path, monkeypatch):
+    monkeypatch.setattr(train_map, "trained_map", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train_map.main(configure(TrainMap, "train_map", [f"demos.path={demos}", f"out={tmp_path / 'map'}"]))
+    assert wandb_file.read_run(tmp_path).exit_code == 1

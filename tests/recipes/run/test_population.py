@@ -260,11 +260,13 @@ def test_a_learner_is_evaluated_like_any_run(seeds, capsys):
 
 
 def test_a_report_takes_a_folder_of_seeds(seeds):
-    report.main(configure(Report, "report", [f"folder={seeds}", "metric=return"]))
+    report.main(
+        configure(Report, "report", ["run.wandb=false", "video=false", f"folder={seeds}", "metric=return"])
+    )
     curves = pandas.read_csv(seeds / "report" / "curves.csv")
     assert sorted(curves["seed"].unique()) == [0, 1, 2]
     assert len(curves) == 6
     assert "| raw | 3 | 200 |" in (seeds / "report" / "return-table.md").read_text()
     report.main(
-        configure(Report, "report", [f"folder={seeds}", "metric=return"])
+        configure(Report, "report", ["run.wandb=false", "video=false", f"folder={seeds}", "metric=return"])
     )  # not thrown by its own files

@@ -23,8 +23,10 @@ from nht.recipes.run.video import (
     SHEET_COLUMNS,
     TILE,
     Film,
+    State,
     contact_sheet,
     grid,
+    grid_columns,
     record_video,
 )
 from nht.recipes.sections import EnvConfig
@@ -58,6 +60,23 @@ def test_a_grid_has_about_as_many_rows_as_columns_and_dark_gaps():
     assert grid([tile(7)]).shape == (4, 6, 3)
 
 
+@pytest.mark.parametrize(
+    ("count", "columns"), [(1, 1), (2, 2), (3, 3), (4, 2), (5, 3), (6, 3), (7, 4), (8, 4), (9, 3), (10, 5)]
+)
+def test_a_grid_is_nearly_square_and_has_few_gaps(count, columns):
+    assert grid_columns(count) == columns
+
+
+def test_a_contact_sheet_says_how_each_copy_stands_in_its_colour():
+    frames = [[np.zeros((80, 240, 3), dtype=np.uint8)] for _ in range(SHEET_COLUMNS)]
+    states = [[State(float(moment), "success" if moment > 2 else "")] for moment in range(SHEET_COLUMNS)]
+    sheet = contact_sheet(frames, states)
+    assert sheet.shape == (40, 120 * SHEET_COLUMNS, 3)
+    assert tuple(sheet[20, 0]) == COLOURS[""]
+    assert tuple(sheet[20, -1]) == COLOURS["success"]
+    assert (sheet[:22, :120] == 255).all(-1).any()  # white letters
+
+
 def test_a_contact_sheet_goes_from_start_to_end():
     frames = [[tile(moment), tile(100 + moment)] for moment in range(50)]
     sheet = contact_sheet(frames)
@@ -71,7 +90,7 @@ def test_films_show_every_copy_to_the_end(tmp_path):
     assert outcome.failure.all()
     video = imageio.imread(tmp_path / "film.mp4")
     width, height = TILE
-    assert video.shape[1:] == (2 * height, 2 * width, 3)
+    assert video.shape[1:] == (height, 3 * width, 3)  # three lie side by side, without a gap
     sheet = imageio.imread(tmp_path / "film.png")
     assert sheet.shape == (3 * height // 2, SHEET_COLUMNS * width // 2, 3)
     assert tuple(sheet[0, 0]) == COLOURS[""]

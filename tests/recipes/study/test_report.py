@@ -5,9 +5,11 @@ import pandas
 import pytest
 
 import toy_search
+import wandb_file
 from nht.recipes import report
 from nht.recipes.config import Report
 from nht.recipes.launch import configure
+from nht.recipes.study.dashboard_names import search_name
 from nht.recipes.study.report import failures, search_summary
 from nht.recipes.study.results import SearchResults, final_scores, read_results
 
@@ -24,10 +26,15 @@ def write(folder, rows):
 def test_the_same_rows_give_the_same_report(tmp_path, metric, capsys):
     folder = write(tmp_path / "search", toy_search.rows(metric=metric))
     for out in ("first", "again"):
-        report.main(configure(Report, "report", [f"folder={folder}", f"out={tmp_path / out}"]))
+        report.main(
+            configure(Report, "report", ["run.wandb=false", f"folder={folder}", f"out={tmp_path / out}"])
+        )
     assert "nht" in capsys.readouterr().out
     first, again = (sorted((tmp_path / out).iterdir()) for out in ("first", "again"))
-    wanted = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} | {"report.md", "report.html"}
+    wanted = {f"{name}.{kind}" for name in FIGURES for kind in ("png", "pdf", "svg")} | {
+        "report.md",
+        "report.html",
+    }
     assert {path.name for path in first} == wanted
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
     text = (tmp_path / "first" / "report.md").read_text()
@@ -36,6 +43,15 @@ def test_the_same_rows_give_the_same_report(tmp_path, metric, capsys):
     assert all(f"]({name}.png)" in text for name in FIGURES)
     page = (tmp_path / "first" / "report.html").read_text()
     assert page.count("data:image/svg+xml;base64,") == len(FIGURES)
+
+
+def test_a_search_is_one_summary_run_that_has_its_tables_and_figures(tmp_path):
+    folder = write(tmp_path / "search", toy_search.rows(4, 2))
+    report.main(configure(Report, "report", [f"folder={folder}"]))
+    found = wandb_file.read_run(folder / "report")
+    assert found.run.display_name == search_name(folder)
+    logged = {name for row in found.rows for name in row}
+    assert {"tables/interfaces", *(f"figures/{name}" for name in FIGURES)} <= logged
 
 
 def test_the_table_tells_the_interfaces_apart():
@@ -72,7 +88,7 @@ def test_correlations_by_interface():
 @pytest.mark.parametrize("shape", [(1, 3), (3, 1), (1, 1)])
 def test_one_configuration_or_one_seed_is_enough(tmp_path, shape):
     folder = write(tmp_path / "search", toy_search.rows(*shape, best_seeds=0))
-    report.main(configure(Report, "report", [f"folder={folder}"]))
+    report.main(configure(Report, "report", ["run.wandb=false", f"folder={folder}"]))
     text = (folder / "report" / "report.md").read_text()
     assert "the very seeds that it was chosen by" in text
 
