@@ -11,7 +11,7 @@ PYTHON ?= python3.11 python3.12 python3.13 python3 python
 PIP_FLAGS ?=
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: help setup lint typecheck test suite test-slow test-versions demo bench clean
+.PHONY: help setup lint typecheck docs test suite test-slow test-versions demo bench clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -45,10 +45,14 @@ typecheck: setup ## Check the types of the installed package
 	cd build/typecheck && ../../$(BIN)/mypy --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache -p nht \
 	    | sed -E 's#^nht/(transforms|envs|recipes|configs)/#\1/#'
 
-suite test-slow: export OMP_NUM_THREADS := 1
-suite test-slow: export WANDB_MODE := offline
+docs: setup ## Build the site: warnings are errors, links are checked, notebooks are run
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo 'The site: site/index.html; with its search: $(BIN)/python -m http.server -d site'
 
-test: lint typecheck suite ## Lint, types and all tests but the slow ones
+docs suite test-slow: export OMP_NUM_THREADS := 1
+docs suite test-slow: export WANDB_MODE := offline
+
+test: lint typecheck docs suite ## Lint, types, the site and all tests but the slow ones
 
 suite: setup ## All tests but the slow ones; TESTS=tests/nht: those in there
 	$(BIN)/pytest -m 'not slow' $(TESTS)
@@ -73,5 +77,5 @@ bench: setup ## Measure speed and what the maps can do; the learning runs are in
 	@for file in benchmarks/speed/*.py benchmarks/maps/*.py; do echo "== $$file"; OMP_NUM_THREADS=1 $(BIN)/python "$$file"; done
 
 clean: ## Remove what building and the tools left; .venv* and runs/ stay
-	rm -rf build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -path './.venv*' -prune -o -name __pycache__ -type d -print0 | xargs -0 rm -rf
