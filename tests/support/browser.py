@@ -39,13 +39,14 @@ def browser():
 def open_page(browser, address, width=800, height=500):
     """The page of a running steer, once the pad and the scene are there; small, as it is drawn in software."""
     page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(120_000)  # drawn in software, on cores that others use, too
     page.asked, page.errors = [], []
     page.on("request", lambda request: page.asked.append(request.url))
     page.on("websocket", lambda opened: page.asked.append(opened.url))
     page.on("pageerror", lambda error: page.errors.append(str(error)))
-    page.goto(address, timeout=120_000)
-    page.locator("[data-clock]").wait_for(timeout=120_000)
-    page.frame_locator("#pad").get_by_text("1 ▸").wait_for(timeout=120_000)
+    page.goto(address)
+    page.locator("[data-clock]").wait_for()
+    page.frame_locator("#pad").get_by_text("1 ▸").wait_for()
     return page
 
 

@@ -42,7 +42,7 @@ class Steering:
         return status
 
 
-def until(condition, seconds=60.0):
+def until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "nothing happened"
@@ -193,8 +193,15 @@ def test_a_slider_drives_a_third_axis_and_springs_back(page):
     choose(page, "nht")
 
 
-def test_several_viewers_see_the_same(page, opened, steering):
-    other = open_page(opened, steering.address)
+@pytest.fixture
+def other(steering, opened):
+    """The page of somebody else."""
+    found = open_page(opened, steering.address)
+    yield found
+    found.close()
+
+
+def test_several_viewers_see_the_same(page, other):
     choose(page, "svd")
     other.get_by_text("person through svd").wait_for()
     with held(page, 0.0, 0.8):
@@ -202,11 +209,9 @@ def test_several_viewers_see_the_same(page, opened, steering):
         until(lambda: float(knob.evaluate("(knob) => parseFloat(knob.style.top)")) < 40)
     choose(other, "nht")
     page.get_by_text("person through nht").wait_for()
-    other.close()
 
 
-def test_a_tab_that_is_closed_in_mid_drag_lets_go_and_the_recording_goes_on(page, opened, steering):
-    other = open_page(opened, steering.address)
+def test_a_tab_that_is_closed_in_mid_drag_lets_go_and_the_recording_goes_on(page, other):
     press(page, "Record")
     page.get_by_text("● recording").or_(page.get_by_text(": 0 steps")).first.wait_for()
     across, down = pad_centre(other)
