@@ -27,6 +27,10 @@ def main(config: TrainMap) -> None:
     device = usable_device(config.device)
     torch.set_num_threads(config.torch_threads)
     wanted(config.run)  # whether W&B is installed, if it is
+    if config.demos.path is not None:
+        nht.load_demos(
+            config.demos.path, env=config.env.name
+        )  # or say what is wrong, before anything is written
     out.parent.mkdir(parents=True, exist_ok=True)
     settings = {"recipe": "train_map", **asdict(config)}
     with shown_on_dashboard(out.parent, settings, config.run, name=out.stem, remembered=False) as dashboard:

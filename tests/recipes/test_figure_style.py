@@ -77,7 +77,7 @@ def test_many_lines_can_be_told_apart():
 
 
 def test_a_figure_is_a_picture_and_a_vector_file_and_the_same_each_time(tmp_path):
-    files = {}
+    files, open_before = {}, plt.get_fignums()
     for name in ("one", "other"):
         with style():
             figure, axes = plt.subplots(figsize=(2, 1), layout="constrained")
@@ -87,7 +87,7 @@ def test_a_figure_is_a_picture_and_a_vector_file_and_the_same_each_time(tmp_path
         files[name] = [(tmp_path / f"{name}{suffix}").read_bytes() for suffix in (".png", ".pdf", ".svg")]
     assert files["one"] == files["other"]
     assert b"Type3" not in files["one"][1]  # fonts that editors of papers accept
-    assert not plt.get_fignums()
+    assert plt.get_fignums() == open_before
 
 
 def test_labels_stand_at_the_ends_in_the_colours_of_their_lines():

@@ -63,9 +63,7 @@ def compose(module: str, words: list[str]) -> object:
 
     with pytest.MonkeyPatch.context() as patch:
         true_launch = launching.launch
-        patch.setattr(
-            launching, "launch", lambda main, *how, **more: true_launch(_like(main, keep), *how, **more)
-        )
+        patch.setattr(launching, "launch", lambda _, *how, **more: true_launch(keep, *how, **more))
         try:
             _start(module, words)
         except Composed as composed:
@@ -107,7 +105,8 @@ def prepare(outside: Path) -> None:
     run("nht.recipes.collect_demos", ["env=six_joints.reach:REACH", "out=runs/reach-demos"])
     run("nht.recipes.train_map", ["demos.path=runs/demos", "out=runs/nht.safetensors"])
     run("nht.recipes.ddpg", ["map.file=runs/nht.safetensors"])
-    shutil.copytree("runs/demos", "shared/demos")
+    for copy in ("shared/demos", "runs/by-hand-wam_wipe"):
+        shutil.copytree("runs/demos", copy)
     Path("runs/search-wam_wipe").mkdir()
     for name in ("rows.csv", "manifest.json"):
         shutil.copy(f"benchmarks/results/search_wam_wipe/{name}", f"runs/search-wam_wipe/{name}")
@@ -120,14 +119,13 @@ def prepare(outside: Path) -> None:
 
 
 def _start(module: str, words: list[str]) -> None:
-    with _arguments([module, *words]):
-        sys.modules.pop(module, None)  # else runpy warns that it is there already
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
-
-
-def _like(main: object, keep: object) -> object:
-    """``keep``, with the name and module of ``main``, which help texts are made from."""
-    return keep
+    kept = sys.modules.pop(module, None)  # else runpy warns that it is there already
+    try:
+        with _arguments([module, *words]):
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+    finally:
+        if kept is not None:
+            sys.modules[module] = kept
 
 
 @contextmanager
