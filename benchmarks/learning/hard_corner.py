@@ -1,6 +1,6 @@
 """WAMWipe's hard corner through every interface, with and without demonstrations in replay, and what it breaks.
 
-Random starts, elbows swivelled by up to 1 rad, a tolerance of 5 mm; DDPG, 150,000 steps, five seeds. Maps are trained
+Random starts, elbows swivelled by up to 1 rad, a tolerance of 5 mm; DDPG, 160,000 steps, five seeds. Maps are trained
 on the expert's 20,000 transitions (k = 2), of which 10,000 stand in the replay buffer where demonstrations take part.
 Writes rows, a table, curves, and success against the share of training episodes that violate the constraint, to
 ``results/hard_corner``.
