@@ -18,7 +18,9 @@ from nht.recipes.agents.norm import ReturnNorm
 from nht.recipes.agents.ppo import PPO, GaussianPPOLoss, advantage_estimator, estimate_advantages, networks
 from nht.recipes.agents.returns import charge_failure, reward_range
 from nht.recipes.agents.settings import Setting
+from nht.recipes.agents.start_from_demos import start_from_demos
 from nht.recipes.launch import launch
+from nht.recipes.run.demonstrations import demonstrated
 from nht.recipes.run.draws import Draws
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.gradient_norms import GradientNorms
@@ -45,6 +47,8 @@ def main(*configs: PPO, together: str | None = None) -> None:
 
     features, actor, critic = learners.networks(partial(networks, envs.train))
     policy = TensorDictSequential(features, actor)
+    shown = demonstrated(folder.configs, folder.maps)
+    start_from_demos(shown, features, actor, folder.configs, algo.learning_rate, ranks)
     possible = reward_range(envs.train)
     rewards = ReturnNorm(envs.copies, algo.gamma, algo.reward_clip, learners=learners.count).to(ranks.device)
     gae = advantage_estimator(algo.gamma, algo.lmbda)

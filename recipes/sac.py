@@ -14,7 +14,9 @@ from nht.recipes.agents.replay import minibatches, replay_buffer, storable
 from nht.recipes.agents.replayed_demos import replay_demos
 from nht.recipes.agents.returns import charge_failure, n_step_returns, reward_range
 from nht.recipes.agents.sac import SAC, DirectSACLoss, networks
+from nht.recipes.agents.start_from_demos import start_from_demos
 from nht.recipes.launch import launch
+from nht.recipes.run.demonstrations import demonstrated
 from nht.recipes.run.environments import RunEnvs
 from nht.recipes.run.folder import RunFolder
 from nht.recipes.run.gradient_norms import GradientNorms
@@ -35,6 +37,8 @@ def main(config: SAC) -> None:
 
     features, actor, critic = networks(envs.train, algo)
     policy = TensorDictSequential(features, actor)
+    shown = demonstrated(folder.configs, folder.maps)
+    start_from_demos(shown, features, actor, folder.configs, algo.actor_learning_rate, ranks)
 
     rewards = reward_range(envs.train)
     action_dim = envs.train.action_spec.shape[-1]
@@ -60,7 +64,7 @@ def main(config: SAC) -> None:
         return storable(look_ahead(charge_failure(steps, algo.gamma, rewards)))
 
     buffer = replay_buffer(ranks.share("algo.buffer_size", algo.buffer_size), ranks.device)
-    demos = replay_demos(folder, ranks, buffer, features, rows)
+    demos = replay_demos(shown, algo.demos.share, ranks, buffer, rows)
     batch_size = ranks.share("algo.batch_size", algo.batch_size)
     record.gradient_norms = GradientNorms(optimiser, "actor", "critic", "temperature")
     parts = {"optimiser": optimiser, "features": features, "buffer": buffer}

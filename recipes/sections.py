@@ -61,16 +61,33 @@ class DemosConfig:
 
 
 @dataclass
-class ReplayDemosConfig:
-    """Which of the run's demonstrations an algorithm with a replay buffer learns from, too."""
+class AlgoDemosConfig:
+    """Which of the run's demonstrations an algorithm learns from, too."""
 
     transitions: int = 0  # how many, from the first on; 0 is none
+    cloning_start: int = 0  # gradient steps in which the actor imitates them before anything else
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a number that is none, or nothing to imitate."""
+        for name in ("transitions", "cloning_start"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"algo.demos.{name} must be at least 0, got {getattr(self, name)}.")
+        if self.cloning_start and not self.transitions:
+            raise ValueError(
+                f"algo.demos.cloning_start={self.cloning_start} imitates demonstrations: set algo.demos.transitions, "
+                "too."
+            )
+
+
+@dataclass
+class ReplayDemosConfig(AlgoDemosConfig):
+    """Demonstrations that an algorithm with a replay buffer replays like steps of its own."""
+
     share: float = 0.0  # of each minibatch, from a buffer of their own; 0 puts them into the replay buffer
 
     def __post_init__(self) -> None:
         """Raise ValueError for a number or share that is none."""
-        if self.transitions < 0:
-            raise ValueError(f"algo.demos.transitions must be at least 0, got {self.transitions}.")
+        super().__post_init__()
         if not 0 <= self.share < 1:
             raise ValueError(f"algo.demos.share must lie in [0, 1), got {self.share}.")
         if self.share and not self.transitions:

@@ -20,7 +20,21 @@ from torchrl.objectives.value import GAE
 from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.settings import Setting, beside, largest
 from nht.recipes.agents.table import Algorithm
-from nht.recipes.sections import AlgoConfig, Training
+from nht.recipes.sections import AlgoConfig, AlgoDemosConfig, Training
+
+
+@dataclass
+class StartDemosConfig(AlgoDemosConfig):
+    """Demonstrations that an algorithm without a replay buffer can only start from."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where nothing would be made of them."""
+        super().__post_init__()
+        if self.transitions and not self.cloning_start:
+            raise ValueError(
+                f"ppo replays no demonstrations, its actor may start from them: with algo.demos.transitions="
+                f"{self.transitions}, set algo.demos.cloning_start, too."
+            )
 
 
 @dataclass
@@ -57,6 +71,7 @@ class PPOConfig(AlgoConfig):
     max_grad_norm: float = 0.8  # a longer gradient is shortened to this
     observation_clip: float = 10.0  # of the normalised observation
     reward_clip: float = 10.0  # of the reward over the deviation of discounted returns
+    demos: StartDemosConfig = field(default_factory=StartDemosConfig)  # to imitate before learning
 
     def __post_init__(self) -> None:
         """Raise ValueError for a value outside its range."""

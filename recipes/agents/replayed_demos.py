@@ -5,44 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torchrl.data import TensorDictReplayBuffer
 
 from nht.recipes.agents.replay import DemosBuffer, replay_buffer
-from nht.recipes.run.demonstrations import asked_for, demonstrated
-from nht.recipes.run.folder import RunFolder
-from nht.recipes.run.population import PopulationFolder
 from nht.recipes.run.ranks import Ranks
 
 
 def replay_demos(
-    folder: RunFolder | PopulationFolder,
+    steps: TensorDictBase | None,
+    share: float,
     ranks: Ranks,
     buffer: TensorDictReplayBuffer,
-    features: TensorDictModule,
     rows: Callable[[TensorDictBase], TensorDictBase],
 ) -> DemosBuffer | None:
-    """Let an algorithm learn from the run's demonstrations, if it is told to, as from steps that it collected.
+    """Let an algorithm learn from the run's demonstrations, if it has any, as from steps that it collected.
 
     TorchRL's ``OfflineToOnlineReplayBuffer`` draws such shares for one minibatch at a time and for one learner; here
     the minibatches of many updates, and of many learners, are drawn at once.
 
     Args:
-        folder: of the run.
+        steps: demonstrated, ``(1, T)``; of several learners ``(L, 1, T)``.
+        share: of every minibatch; with 0 they go into ``buffer``.
         ranks: the processes that learn together; each takes its part of the demonstrations.
-        buffer: of what is collected; without ``algo.demos.share`` they go in there.
-        features: the normaliser, which takes their observations into its statistics.
+        buffer: of what is collected.
         rows: makes rows of a buffer of steps ``(copies, T)``, or ``(learners, copies, T)``.
 
     Returns:
         what ``minibatches`` draws their share from; None if they have none.
     """
-    steps = demonstrated(folder.configs, folder.maps)
     if steps is None:
         return None
-    own = slice(ranks.rank, None, ranks.size)
-    features.module.update(steps["observation"][..., own, :], ranks.sum)
-    share, found = asked_for(folder.config).share, rows(steps)[own]
+    found = rows(steps)[ranks.rank :: ranks.size]
     if not share:
         buffer.extend(found)
         return None

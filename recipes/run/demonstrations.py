@@ -21,15 +21,15 @@ from nht.recipes.data.recording import record_expert
 from nht.recipes.maps.kinds import task_context_keys
 from nht.recipes.run.environments import base_env
 from nht.recipes.run.metrics import DEMOS_CLIPPED, DEMOS_MISSED
-from nht.recipes.sections import EnvConfig, ReplayDemosConfig, Training
+from nht.recipes.sections import AlgoDemosConfig, EnvConfig, ReplayDemosConfig, Training
 from nht.transforms import ActionMapTransform
 from nht.writing import replacing
 
 DEMOS_FOLDER, DEMOS_FILE = "demos", "demos.json"
 """In a run's folder: what was recorded for the run, and how well its map expresses what it learns from."""
 
-NEEDED = ("observation", "reward", "terminated", ("next", "observation"))
-"""What a replay buffer needs of demonstrations, beside their actuations, episodes and the map's context."""
+REPLAYED = ("reward", "terminated", ("next", "observation"))
+"""What a replay buffer needs of demonstrations, beside what imitation does: observations, actuations, a context."""
 
 REWARD_TOLERANCE = 1e-6
 """How far a reward in single precision may lie beyond the task's bounds, as a share of these."""
@@ -39,10 +39,15 @@ WARNED, REFUSED = 0.1, 1.0
 map is a baseline that one may want to see, so it is warned about only."""
 
 
-def asked_for(config: Training) -> ReplayDemosConfig:
+def asked_for(config: Training) -> AlgoDemosConfig:
     """The demonstrations that the run's algorithm learns from; none where it has no such option."""
     demos = getattr(config.algo, "demos", None)
-    return demos if isinstance(demos, ReplayDemosConfig) else ReplayDemosConfig()
+    return demos if isinstance(demos, AlgoDemosConfig) else AlgoDemosConfig()
+
+
+def replays(config: Training) -> bool:
+    """Whether the run's algorithm learns from demonstrations as from steps that it collected."""
+    return isinstance(asked_for(config), ReplayDemosConfig)
 
 
 def transitions_asked(config: Training) -> int:
@@ -84,27 +89,32 @@ def provide_demos(config: Training, resuming: bool) -> Training:
             )
         if not (resuming and path.exists()):
             record_expert(config.env, config.demos, config.seed, path)
-    check_demos(nht.load_demos(path, env=config.env.name), count, config.env, str(path))
+    check_demos(nht.load_demos(path, env=config.env.name), count, config, str(path))
     return replace(config, demos=replace(config.demos, path=config.demos.path or str(path)))
 
 
-def check_demos(demos: nht.Demos, count: int, env: EnvConfig, name: str) -> None:
-    """Check that demonstrations can be replayed in a task. Raises as ``provide_demos`` does; ``name`` is theirs."""
-    data = demos.data
-    if missing := [key_name(key) for key in NEEDED if data.get(key, None) is None]:
+def check_demos(demos: nht.Demos, count: int, config: Training, name: str) -> None:
+    """Check that a run can learn from demonstrations. Raises as ``provide_demos`` does; ``name`` is theirs."""
+    data, env, replayed = demos.data, config.env, replays(config)
+    needed = ("observation", *(REPLAYED if replayed else ()))
+    if missing := [key_name(key) for key in needed if data.get(key, None) is None]:
         raise KeyError(f"{name} lacks {missing}, which algo.demos needs: it has {listed(data)}.")
     if count > len(demos):
         raise ValueError(f"algo.demos.transitions={count} must be at most the {len(demos)} of {name}.")
     task = base_env(env, seed=0, num_envs=1)
     task.close()
     seen = task.observation_spec["observation"].shape[-1]
-    widths = {"observation": seen, ("next", "observation"): seen, "actuation": task.action_spec.shape[-1]}
+    widths: dict[Any, int] = {"observation": seen, "actuation": task.action_spec.shape[-1]}
+    if replayed:
+        widths["next", "observation"] = seen
     for key, width in widths.items():
         if data[key].shape[-1] != width:
             raise ValueError(
                 f"{name} does not fit {env.name}: {key_name(key)!r} has {data[key].shape[-1]} entries, the task's "
                 f"{width}."
             )
+    if not replayed:
+        return
     low, high = reward_range(task)
     rewards = data["reward"][:count]
     least, most = float(rewards.min()), float(rewards.max())
@@ -154,8 +164,9 @@ def note_demos(config: Training, map: nht.ActionMap) -> dict[str, float]:
 def demo_steps(config: Training, map: nht.ActionMap) -> tuple[TensorDict, dict[str, float]]:
     """The first demonstrated transitions as steps ``(T,)`` that a collector could have made through the map.
 
-    An action is what the map makes of the recorded actuation, ``map.encode``, clipped to [-1, 1]. Ends are those that
-    were recorded; a failure is what is called so, or else an end without success.
+    An action is what the map makes of the recorded actuation, ``map.encode``, clipped to [-1, 1]. What an algorithm
+    that replays nothing gets ends there. Else ends are those that were recorded; a failure is what is called so, or
+    else an end without success.
 
     Returns:
         the steps; and the share of the actions' numbers that were clipped and the share of energy
@@ -173,7 +184,9 @@ def demo_steps(config: Training, map: nht.ActionMap) -> tuple[TensorDict, dict[s
             DEMOS_CLIPPED: float((free != action).double().mean()),
             DEMOS_MISSED: _missed(config.env, map, action, data, keys),
         }
-    return _steps(data, action.float()), measured
+    seen = {"observation": data["observation"].float(), "action": action.float()}
+    steps = TensorDict(seen, [len(data)], device=device)
+    return (steps.set("next", _outcomes(data)) if replays(config) else steps), measured
 
 
 def _missed(
@@ -193,29 +206,21 @@ def _missed(
     return float(error / energy) if energy > 0 else float(error)
 
 
-def _steps(data: TensorDictBase, action: Tensor) -> TensorDict:
+def _outcomes(data: TensorDictBase) -> TensorDict:
     rows = len(data), 1
     episode = data["episode"]
     last = torch.cat([episode[1:] != episode[:-1], torch.ones_like(episode[:1], dtype=torch.bool)])
     terminated = data["terminated"].reshape(rows).bool()
     success = data["success"].reshape(rows).bool() if "success" in data else torch.zeros_like(terminated)
     failure = data["failure"].reshape(rows).bool() if "failure" in data else terminated & ~success
-    outcome = {
+    outcomes = {
         "observation": data["next", "observation"].float(),
         "reward": data["reward"].reshape(rows).float(),
         "done": terminated | last.unsqueeze(-1),
         "terminated": terminated,
         "failure": failure,
     }
-    return TensorDict(
-        {
-            "observation": data["observation"].float(),
-            "action": action,
-            "next": TensorDict(outcome, batch_size=[len(data)]),
-        },
-        batch_size=[len(data)],
-        device=action.device,
-    )
+    return TensorDict(outcomes, [len(data)])
 
 
 def demonstrated(configs: Sequence[Training], maps: Sequence[nht.ActionMap]) -> TensorDictBase | None:

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 from tensordict import TensorDict
@@ -15,8 +16,10 @@ from nht.recipes.agents.norm import ReturnNorm, RunningNorm
 from nht.recipes.agents.off_policy import JointSoftUpdate, descend
 from nht.recipes.agents.ppo import GaussianActor, GaussianPPOLoss
 from nht.recipes.agents.sac import DirectSACLoss, GaussianHead, tanh_gaussian
+from nht.recipes.agents.start_from_demos import start_from_demos
 from nht.recipes.agents.td3 import DirectTD3Loss
 from nht.recipes.run.ranks import Ranks
+from nht.recipes.sections import AlgoDemosConfig
 
 OBSERVATION, ACTION, BATCH, UPDATES = 5, 2, 64, 10
 
@@ -128,8 +131,19 @@ def update(algorithm, ranks):
     ]
 
 
+def start(ranks):
+    """Weights and statistics of an actor that started from demonstrations."""
+    norm, actor, _ = (module.to(ranks.device) for module in networks("td3"))
+    steps = next(batches()).select("observation", "action").unsqueeze(0).to(ranks.device)
+    demos = AlgoDemosConfig(transitions=BATCH, cloning_start=UPDATES)
+    config = SimpleNamespace(seed=3, algo=SimpleNamespace(demos=demos))
+    start_from_demos(steps, norm, actor, [config], 1e-2, ranks)
+    return [*actor.state_dict().values(), *norm.state_dict().values()]
+
+
 if __name__ == "__main__":
     ranks = Ranks()
+    torch.save(start(ranks), Path(sys.argv[1]) / f"start-{ranks.rank}.pt")
     for algorithm in ("ddpg", "ppo", "sac", "td3"):
         torch.save(update(algorithm, ranks), Path(sys.argv[1]) / f"{algorithm}-{ranks.rank}.pt")
     ranks.part()

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from nht.recipes.agents import replayed_demos
 from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.off_policy import OffPolicyConfig
 from nht.recipes.agents.replay import DemosBuffer, minibatches, replay_buffer
+from nht.recipes.agents.replayed_demos import replay_demos
+from nht.recipes.agents.start_from_demos import start_from_demos
 from nht.recipes.run.draws import Draws
 from nht.recipes.sections import ReplayDemosConfig
 
@@ -116,18 +117,17 @@ def test_without_demonstrations_minibatches_are_plain_draws_from_the_buffer() ->
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_processes_divide_the_demonstrations(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_divide_the_demonstrations(share: float) -> None:
     steps = TensorDict({"observation": torch.arange(7.0).view(1, 7, 1)}, [1, 7])
-    monkeypatch.setattr(replayed_demos, "demonstrated", lambda *_: steps)
-    demos = ReplayDemosConfig(transitions=7, share=share)
-    folder: Any = SimpleNamespace(
-        config=SimpleNamespace(algo=SimpleNamespace(demos=demos)), configs=[], maps=[]
-    )
     found, seen = [], []
     for rank in range(2):
         ranks: Any = SimpleNamespace(rank=rank, size=2, device=CPU, sum=lambda values: values)
+        config: Any = SimpleNamespace(
+            algo=SimpleNamespace(demos=ReplayDemosConfig(transitions=7, share=share))
+        )
         buffer, normaliser = replay_buffer(20, CPU), features()
-        beside = replayed_demos.replay_demos(folder, ranks, buffer, normaliser, lambda rows: rows.reshape(-1))
+        start_from_demos(steps, normaliser, normaliser, [config], 1e-3, ranks)
+        beside = replay_demos(steps, share, ranks, buffer, lambda rows: rows.reshape(-1))
         assert (beside is None) == (share == 0)
         kept = buffer if beside is None else beside.buffer
         assert len(buffer) == (0 if share else len(kept))

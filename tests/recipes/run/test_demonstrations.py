@@ -241,8 +241,13 @@ def test_learners_share_how_many_they_learn_from(demos: Path, tmp_path: Path) ->
 
 
 def test_an_algorithm_without_replay(demos: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="Key 'demos' not in 'PPOConfig'"):
+    with pytest.raises(ValueError, match="Key 'share' not in 'StartDemosConfig'"):
         run("ppo", tmp_path / "run", *told(demos))
+    asked = [f"demos.path={demos}", f"algo.demos.transitions={COUNT}"]
+    with pytest.raises(
+        ValueError, match=f"with algo.demos.transitions={COUNT}, set algo.demos.cloning_start"
+    ):
+        run("ppo", tmp_path / "run", *asked)
 
 
 def test_the_folder_of_a_run_refuses_before_a_map_is_trained(demos: Path, tmp_path: Path) -> None:

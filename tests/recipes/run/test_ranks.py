@@ -52,6 +52,14 @@ def test_two_ranks_with_half_the_batch_equal_one_with_the_whole(trained_by_two, 
     assert sum(torch.equal(old, new) for old in untrained for new in alone if old.shape == new.shape) == 0
 
 
+def test_two_ranks_start_from_demonstrations_as_one_does(trained_by_two):
+    alone = two_ranks.start(Ranks())
+    together = [torch.load(trained_by_two / f"start-{rank}.pt") for rank in (0, 1)]
+    for one, *two in zip(alone, *together, strict=True):
+        assert two[0].equal(two[1])
+        torch.testing.assert_close(two[0], one, rtol=0, atol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
 def test_a_recipe_with_two_ranks(algorithm, tmp_path):

@@ -8,15 +8,25 @@ from pathlib import Path
 import pandas
 import pytest
 import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import nht
 import populations
 import tiny_runs
+from nht.recipes.agents.policy import load_policy
 from nht.recipes.data.recording import record_expert
+from nht.recipes.run.demonstrations import demo_steps
+from nht.recipes.run.environments import mapped_env
+from nht.recipes.run.saved_run import read_config
 from nht.recipes.sections import DemosConfig, EnvConfig
 
 OFF_POLICY = ("ddpg", "sac", "td3")
-CLONING = ["algo.demos.cloning=3", "algo.demos.cloning_frames=350", "algo.demos.q_filter=true"]
+CLONING = [
+    "algo.demos.cloning=3",
+    "algo.demos.cloning_start=20",
+    "algo.demos.cloning_frames=350",
+    "algo.demos.q_filter=true",
+]
 COUNT = 250
 FRAME = pandas.testing.assert_frame_equal
 
@@ -56,6 +66,28 @@ def test_a_run_may_imitate_them(algorithm: str, demos: Path, tmp_path: Path) -> 
     plain = run(algorithm, tmp_path / "plain", *told(demos, 0.5))
     imitating = run(algorithm, tmp_path / "imitating", *told(demos, 0.5), "algo.demos.cloning=3")
     assert (imitating["loss_actor"] > plain["loss_actor"]).all()
+
+
+@pytest.mark.parametrize("algorithm", tiny_runs.RECIPES)
+def test_a_run_may_start_from_them(algorithm: str, demos: Path, tmp_path: Path) -> None:
+    """A run of a few steps ends near what its actor started with."""
+    data, distances = nht.load_demos(demos).data[:COUNT], []
+    for updates in (1, 400):
+        folder = tmp_path / str(updates)
+        asked = [
+            f"demos.path={demos}",
+            f"algo.demos.transitions={COUNT}",
+            f"algo.demos.cloning_start={updates}",
+        ]
+        short = ["algo.hidden=[32,32]", "algo.total_frames=100", "evaluation.every=100"]
+        tiny_runs.start(algorithm, folder, *asked, *short)
+        config = read_config(folder)
+        policy = load_policy(folder, mapped_env(config.env, nht.Identity(7), seed=0, num_envs=1), config)
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            action = policy(data.select("observation"))["action"]
+        shown = demo_steps(config, nht.Identity(7))[0]["action"]
+        distances.append(float((action - shown).square().mean()))
+    assert distances[1] < 0.5 * distances[0]
 
 
 def test_without_a_folder_the_expert_records_them_in_the_run(tmp_path: Path) -> None:
