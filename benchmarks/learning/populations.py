@@ -16,15 +16,25 @@ import numpy as np
 import pandas
 from matplotlib.axes import Axes
 
+from nht.recipes.agents.table import find_algorithm
 from nht.recipes.figure_style import PAGE, save_figure, style, thousands
+from nht.recipes.launch import configure
 from nht.recipes.run.metrics import FAILURE, FRAMES, SUCCESS, tested, trained
 from nht.recipes.study.curves import read_runs, summarise
 from nht.recipes.study.report import to_markdown
 from nht.recipes.study.scores import interval
 
-ARMS = ["algo.hidden=[128,128]", "algo.bfloat16=true", "evaluation.episodes=50", "evaluation.every=20_000"]
+ARMS = [
+    "algo.hidden=[128,128]",
+    "algo.bfloat16=true",
+    "evaluation.episodes=50",
+    "evaluation.every=20_000",
+    "run.checkpoint_every=20_000",
+]
 """Settings of the studies on the arm's tasks."""
-QUIET = ["evaluation.video=false", "run.wandb=false", "run.checkpoint_every=20_000"]
+QUIET = ["evaluation.video=false", "run.wandb=false"]
+TOGETHER = ("ddpg", "ppo")
+"""Algorithms whose learners can share every call; the seeds of others are trained one after the other."""
 COLUMNS = ["task", "interface", "seed", FRAMES, tested(SUCCESS), tested(FAILURE), trained(FAILURE), "seconds"]
 
 
@@ -35,10 +45,30 @@ def made(file: Path, recipe: str, told: Sequence[str]) -> Path:
     return file
 
 
-def trained_runs(run: Path, told: Sequence[str], seeds: int = 5) -> pandas.DataFrame:
-    """The evaluations of a population of DDPG, trained first if need be."""
-    _run("ddpg", [*told, *QUIET, f"seeds={seeds}", f"run.folder={run}", "run.resume=auto"])
+def trained_runs(
+    run: Path, told: Sequence[str], seeds: Sequence[int] = range(5), algorithm: str = "ddpg"
+) -> pandas.DataFrame:
+    """The evaluations of several seeds, trained first if need be: as one population where the algorithm has them."""
+    told = [*told, *QUIET, "run.resume=auto"]
+    if algorithm in TOGETHER:
+        _run(algorithm, [*told, f"seed={seeds[0]}", f"seeds={len(seeds)}", f"run.folder={run}"])
+    else:
+        for seed in seeds:
+            _run(algorithm, [*told, f"seed={seed}", f"run.folder={run / f'seed-{seed}'}"])
     return read_runs([run])
+
+
+def trained_together(
+    folder: Path, learners: Mapping[str, Sequence[str]], algorithm: str
+) -> dict[str, pandas.DataFrame]:
+    """The evaluations of learners that differ, by their names, trained first as one population if need be."""
+    found = find_algorithm(algorithm)
+    configs = [
+        configure(found.schema, algorithm, [*told, *QUIET, "run.resume=auto", f"run.folder={folder / name}"])
+        for name, told in learners.items()
+    ]
+    found.train(*configs, together=str(folder))
+    return {name: read_runs([folder / name]) for name in learners}
 
 
 def _run(recipe: str, told: Sequence[str]) -> None:
@@ -47,7 +77,7 @@ def _run(recipe: str, told: Sequence[str]) -> None:
 
 
 def save(curves: pandas.DataFrame, out: Path, name: str) -> None:
-    """Write the rows and the table of variants, which are told apart by their ``interface``."""
+    """Write rows and table of variants, told apart by their ``interface``, of a task in which episodes succeed."""
     out.mkdir(parents=True, exist_ok=True)
     curves[COLUMNS].to_csv(out / f"{name}.csv", index=False)
     table = summarise(curves)

@@ -1,0 +1,168 @@
+"""HalfCheetah through interfaces: settings found with equal care for each, then five fresh seeds at 1,003,520 steps.
+
+PPO through raw torques, SVD's plane and NHT (k = 2), the latter two with and without corrections (a residual of 0.3).
+
+1. *Demonstrations*: the committed episode, as the paper has it; and ten episodes of three stages of an expert's
+   learning, after 307,200, 614,400 and 1,003,520 steps.
+2. *Trials*: eight settings for each interface, two seeds each, 307,200 steps. Raw torques have one setting, the action
+   scale; SVD two, all pairs of which are tried; NHT four of two levels each, of which every other combination is tried,
+   so that each level is seen four times and no pair of settings hides another.
+3. Of every setting the level that did better in the mean is taken to 1,003,520 steps.
+
+Each stage trains the seeds and settings of an interface as one population. Writes trials, curves, a table and a figure
+to ``results/half_cheetah_interfaces``.
+
+    python benchmarks/learning/half_cheetah_interfaces.py FOLDER [INTERFACE ...]
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas
+import torch
+
+import nht
+from nht.recipes.run.metrics import FRAMES, RETURN, SECONDS, tested
+from nht.recipes.study.curves import plot, summarise
+from nht.recipes.study.report import to_markdown
+from populations import made, trained_runs, trained_together
+
+RESULTS = Path(__file__).parents[1] / "results" / "half_cheetah_interfaces"
+ONE_EPISODE = Path(__file__).parents[1] / "demos" / "half_cheetah"
+EXPERT = {307_200: 3, 614_400: 3, 1_003_520: 4}
+"""Steps of learning, and the number of episodes that are recorded after them."""
+
+TASK = ["env=half_cheetah", "evaluation.episodes=10"]
+TRIAL = [*TASK, "algo.total_frames=307_200", "evaluation.every=102_400", "run.checkpoint_every=102_400"]
+WHOLE = [
+    *TASK,
+    "algo.total_frames=1_003_520",
+    "evaluation.every=71_680",
+    "evaluation.final_episodes=50",
+    "run.checkpoint_every=143_360",
+]
+TRIED, FRESH = range(2), range(100, 105)
+"""Seeds of the trials, and of the experiment."""
+
+Setting = Mapping[str, Any]
+PLANE = {"scale": (1.0, 1.75, 2.5, 3.5), "episodes": ("one", "ten")}
+BASIS = {
+    "scale": (1.75, 3.5),
+    "episodes": ("one", "ten"),
+    "lipschitz": (0.03, 0.1),
+    "context": ("observation", "joint_angle"),
+}
+INTERFACES: dict[str, Mapping[str, tuple[Any, ...]]] = {
+    "raw": {"scale": (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0, 7.0)},
+    "svd": PLANE,
+    "svd, corrected": PLANE,
+    "nht": BASIS,
+    "nht, corrected": BASIS,
+}
+
+
+def main() -> None:
+    """Record, try and train what is missing, and show what was learned."""
+    folder = Path(sys.argv[1]).resolve()
+    record_ten_episodes(folder)
+    trials, curves = [], []
+    for interface in sys.argv[2:] or INTERFACES:
+        tried = try_out(interface, folder)
+        trials.append(tried)
+        best = chosen(tried, INTERFACES[interface])
+        print(interface, best, flush=True)
+        run = folder / "whole" / interface.replace(", ", "-")
+        found = trained_runs(run, [*WHOLE, *told(interface, best, folder)], FRESH, "ppo")
+        curves.append(found.assign(interface=interface))
+        save(pandas.concat(trials, ignore_index=True), pandas.concat(curves, ignore_index=True))
+
+
+def record_ten_episodes(folder: Path) -> None:
+    """Ten episodes of three stages of an expert's learning, in ``folder/ten``."""
+    if (folder / "ten").exists():
+        return
+    parts, episodes = [], 0
+    for steps, count in EXPERT.items():
+        learning = [*TASK, "map=none", "map.action_scale=3.0", f"algo.total_frames={steps}"]
+        every = [f"evaluation.every={steps}", "run.checkpoint_every=102_400"]
+        trained_runs(folder / "experts" / str(steps), [*learning, *every], range(10, 11), "ppo")
+        (source,) = (folder / "experts" / str(steps)).rglob("policy.safetensors")
+        asked = ["env=half_cheetah", "source=policy", f"source.path={source.parent}"]
+        recorded = made(
+            folder / f"stage-{steps}", "collect_demos", [*asked, f"demos.transitions={1_000 * count}"]
+        )
+        data = nht.load_demos(recorded).data.clone()
+        data["episode"] += episodes
+        episodes += count
+        parts.append(data)
+    nht.save_demos(torch.cat(parts), folder / "ten", env="half_cheetah")
+
+
+def try_out(interface: str, folder: Path) -> pandas.DataFrame:
+    """The trials of an interface: their settings, seed and return."""
+    settings, rows = half_of(INTERFACES[interface]), []
+    # Learners share every call, so maps of a population have contexts of one width.
+    for context in dict.fromkeys(setting.get("context", "") for setting in settings):
+        learners, tried = {}, []
+        for setting, seed in itertools.product(settings, TRIED):
+            if setting.get("context", "") == context:
+                name = "-".join([*(f"{name}={value}" for name, value in setting.items()), f"seed={seed}"])
+                learners[name] = [*TRIAL, *told(interface, setting, folder), f"seed={seed}"]
+                tried.append({"interface": interface, **setting, "seed": seed})
+        runs = trained_together(
+            folder / "trials" / f"{interface.replace(', ', '-')}-{context}", learners, "ppo"
+        )
+        for row, found in zip(tried, runs.values(), strict=True):
+            rows.append(row | {tested(RETURN): float(found[tested(RETURN)].iloc[-1])})
+    return pandas.DataFrame(rows)
+
+
+def half_of(levels: Mapping[str, tuple[Any, ...]]) -> list[Setting]:
+    """All combinations; of four settings every other one, those whose levels' places add up to an even number."""
+    places = itertools.product(*(range(len(values)) for values in levels.values()))
+    kept = [each for each in places if len(levels) < 4 or sum(each) % 2 == 0]
+    return [
+        {name: values[place] for (name, values), place in zip(levels.items(), each, strict=True)}
+        for each in kept
+    ]
+
+
+def chosen(trials: pandas.DataFrame, levels: Mapping[str, tuple[Any, ...]]) -> Setting:
+    """Of every setting the level with the higher mean return."""
+    return {name: trials.groupby(name)[tested(RETURN)].mean().idxmax() for name in levels}
+
+
+def told(interface: str, setting: Setting, folder: Path) -> list[str]:
+    """What a run is told of its interface, whose map is trained first if need be."""
+    scale = f"map.action_scale={setting['scale']}"
+    kind, _, corrected = interface.partition(", ")
+    if kind == "raw":
+        return ["map=none", scale]
+    demos = ONE_EPISODE if setting["episodes"] == "one" else folder / "ten"
+    name, asked = f"{kind}-{setting['episodes']}", [f"map={kind}", f"demos.path={demos}"]
+    if kind == "nht":
+        name += f"-{setting['lipschitz']}-{setting['context']}"
+        asked += [f"map.lipschitz={setting['lipschitz']}", f"env.context_keys=[{setting['context']}]"]
+    map = made(folder / f"{name}.safetensors", "train_map", ["env=half_cheetah", *asked, "map.action_dim=2"])
+    return [f"map={kind}", f"map.file={map}", scale, *(["map.residual=0.3"] if corrected else [])]
+
+
+def save(trials: pandas.DataFrame, curves: pandas.DataFrame) -> None:
+    """Write rows, table and figure."""
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    trials.to_csv(RESULTS / "trials.csv", index=False)
+    columns = ["task", "interface", "seed", FRAMES, tested(RETURN), SECONDS]
+    curves[columns].to_csv(RESULTS / "curves.csv", index=False)
+    table = summarise(curves, RETURN)
+    (RESULTS / "table.md").write_text(to_markdown(table))
+    plot(curves, RETURN, "HalfCheetah, PPO", RESULTS / "return.png")
+    print(table.to_string(index=False), flush=True)
+
+
+if __name__ == "__main__":
+    main()
