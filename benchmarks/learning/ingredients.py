@@ -88,6 +88,8 @@ def variants(task: str) -> dict[str, tuple[str, list[str]]]:
     ahead, memory, updates = (3, 10, 200) if task == "half_cheetah" else (1, 1, 40)
     added = {
         "DDPG": [],
+        "observations as they are": ["algo.observation_norm=false"],
+        "the same, layer norm, critic": ["algo.observation_norm=false", "algo.layer_norm=critic"],
         "layer norm, critic": ["algo.layer_norm=critic"],
         "layer norm, both": ["algo.layer_norm=all"],
         "25 quantiles": ["algo.quantiles=25"],

@@ -15,9 +15,8 @@ from torchrl.objectives import DDPGLoss
 
 from nht.recipes.agents.cloning import ClonedDemosConfig, Cloning
 from nht.recipes.agents.critics import critic_network, quantile_loss
-from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.off_policy import OffPolicyConfig, mean_over
-from nht.recipes.agents.perceptrons import perceptron
+from nht.recipes.agents.perceptrons import normaliser, perceptron
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.settings import Setting, beside
 from nht.recipes.agents.table import Algorithm
@@ -85,11 +84,10 @@ def networks(env: EnvBase, algo: DDPGConfig) -> tuple[TensorDictModule, TensorDi
         the lowest return that is possible, or near 0 where rewards know no bound.
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-    norm = RunningNorm(size, algo.observation_clip).to(env.device)
     layers = perceptron(algo, size, action_dim, env.device, normed=algo.layer_norm == "all")
     actor = nn.Sequential(layers, nn.Tanh())
     return (
-        TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
+        normaliser(env, algo),
         TensorDictModule(actor, in_keys=["features"], out_keys=["action"]),
         critic_network(env, algo, algo.quantiles),
     )

@@ -84,6 +84,17 @@ class RunningNorm(nn.Module):
         return values.view(*self.count.shape, *[1] * (observation.ndim - values.ndim), values.shape[-1])
 
 
+class NoNorm(nn.Module):
+    """Leaves observations as they are, in the place of a ``RunningNorm``."""
+
+    def update(self, observation: Tensor, add: Reduction = alone) -> None:
+        """Nothing: there are no statistics."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The observations."""
+        return observation
+
+
 class ReturnNorm(nn.Module):
     """Divides rewards by the deviation of the discounted returns so far, and clips, as OpenAI's baselines do.
 

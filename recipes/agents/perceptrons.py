@@ -1,13 +1,16 @@
-"""The networks of algorithms with a replay buffer: layers, their precision and their normalisation."""
+"""The networks of algorithms with a replay buffer: what they see, their layers, precision and normalisation."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP
 
+from nht.recipes.agents.norm import NoNorm, RunningNorm
 from nht.recipes.agents.off_policy import OffPolicyConfig
 
 
@@ -22,6 +25,13 @@ class HalfPrecisionMLP(MLP):
             for layer in layers:
                 hidden = layer(hidden)
         return last(hidden.float())
+
+
+def normaliser(env: EnvBase, algo: OffPolicyConfig) -> TensorDictModule:
+    """What networks see of an observation: ``"observation"`` to ``"features"``, of the same width."""
+    size = env.observation_spec["observation"].shape[-1]
+    norm = RunningNorm(size, algo.observation_clip) if algo.observation_norm else NoNorm()
+    return TensorDictModule(norm.to(env.device), in_keys=["observation"], out_keys=["features"])
 
 
 def perceptron(

@@ -22,9 +22,8 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss
 
 from nht.recipes.agents.critics import CriticPair, critic_network
-from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.off_policy import OffPolicyConfig
-from nht.recipes.agents.perceptrons import perceptron
+from nht.recipes.agents.perceptrons import normaliser, perceptron
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import Training
 
@@ -84,10 +83,9 @@ def networks(
         ``"state_action_value"``.
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-    norm = RunningNorm(size, algo.observation_clip).to(env.device)
     head = perceptron(algo, size, 2 * action_dim, env.device, normed=algo.layer_norm == "all")
     return (
-        TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
+        normaliser(env, algo),
         tanh_gaussian(GaussianHead(head)),
         critic_network(env, algo),
     )

@@ -16,9 +16,8 @@ from torchrl.objectives import TD3Loss
 
 from nht.recipes.agents.cloning import ClonedDemosConfig, Cloning
 from nht.recipes.agents.critics import CriticPair, critic_network
-from nht.recipes.agents.norm import RunningNorm
 from nht.recipes.agents.off_policy import OffPolicyConfig
-from nht.recipes.agents.perceptrons import perceptron
+from nht.recipes.agents.perceptrons import normaliser, perceptron
 from nht.recipes.agents.returns import UNBOUNDED, Range, return_range
 from nht.recipes.agents.table import Algorithm
 from nht.recipes.sections import Training
@@ -62,10 +61,9 @@ def networks(env: EnvBase, algo: TD3Config) -> tuple[TensorDictModule, TensorDic
         one critic, features and action to a ``"state_action_value"``.
     """
     size, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
-    norm = RunningNorm(size, algo.observation_clip).to(env.device)
     mean = perceptron(algo, size, action_dim, env.device, normed=algo.layer_norm == "all")
     return (
-        TensorDictModule(norm, in_keys=["observation"], out_keys=["features"]),
+        normaliser(env, algo),
         TensorDictModule(nn.Sequential(mean, nn.Tanh()), in_keys=["features"], out_keys=["action"]),
         critic_network(env, algo),
     )

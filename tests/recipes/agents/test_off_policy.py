@@ -16,6 +16,7 @@ import tiny_runs
 from nht.recipes import collect_demos, evaluate
 from nht.recipes.agents.critics import CriticPair, critic_network
 from nht.recipes.agents.norm import RunningNorm
+from nht.recipes.agents.policy import load_policy
 from nht.recipes.agents.replay import STORED, minibatches, replay_buffer, storable
 from nht.recipes.agents.td3 import DirectTD3Loss, TD3Config, networks
 from nht.recipes.config import CollectDemos, Evaluate
@@ -126,6 +127,22 @@ def test_seeds_act_and_repeat(algorithm, tmp_path):
 def test_every_task(algorithm, task, tmp_path):
     metrics = tiny_runs.train(algorithm, tmp_path / "run", *SHORT, f"env={task}", "algo.bfloat16=true")
     assert metrics[["loss_actor", "loss_qvalue", "eval_return"]].notna().all(axis=None)
+
+
+@pytest.mark.parametrize("algorithm", ["ddpg", *ALGORITHMS])
+def test_networks_may_see_observations_as_they_are(algorithm, tmp_path):
+    """No statistics are taken, kept or needed to go on; and it matters."""
+    raw = ["algo.observation_norm=false", "evaluation.every=200"]
+    whole = tiny_runs.train(algorithm, tmp_path / "whole", *raw, "algo.total_frames=400")
+    tiny_runs.train(algorithm, tmp_path / "run", *raw, "algo.total_frames=200")
+    more = tiny_runs.train(algorithm, tmp_path / "run", *raw, "algo.total_frames=400", "run.resume=true")
+    pandas.testing.assert_frame_equal(more, whole)
+    normed = tiny_runs.train(algorithm, tmp_path / "normed", "evaluation.every=200", "algo.total_frames=400")
+    assert not normed["loss_actor"].equals(whole["loss_actor"])
+    env, config = nht.envs.make_env("wam_wipe"), read_config(tmp_path / "whole")
+    policy = load_policy(tmp_path / "whole", env, config)
+    seen = policy(TensorDict({"observation": 9.0 * torch.ones(1, 16)}, [1]))["features"]
+    assert seen.equal(9.0 * torch.ones(1, 16))
 
 
 @pytest.fixture(scope="module")
