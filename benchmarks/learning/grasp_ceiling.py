@@ -8,7 +8,8 @@ they were trained on, 100,000 transitions each:
 - ``relabelled``: an agent that learned through the clean map drives every other copy, the expert's answers are
   recorded in all (DAgger).
 
-``corrected`` adds a residual of 0.3 rad/s. Writes rows, table and figure to ``results/grasp_ceiling``.
+``corrected`` adds a residual of 0.3 rad/s. The best of them then learn for 1,000,000 steps with five fresh seeds.
+Writes rows, tables and figures to ``results/grasp_ceiling``.
 
     python benchmarks/learning/grasp_ceiling.py FOLDER
 """
@@ -24,7 +25,7 @@ from populations import ARMS, made, plot, save, trained_runs
 
 OUT = Path(__file__).parents[1] / "results" / "grasp_ceiling"
 TASK = ["env=wam_grasp", "demos.transitions=100_000"]
-LEARNER = [*ARMS, "env=wam_grasp", "algo=ddpg_grasp", "map.action_scale=1", "algo.total_frames=200_000"]
+LEARNER = [*ARMS, "env=wam_grasp", "algo=ddpg_grasp", "map.action_scale=1"]
 COLOURS = {"clean": "#0072B2", "disturbed": "#D55E00", "relabelled": "#009E73"}
 CORRECTIONS = {"": [], ", corrected": ["map.residual=0.3"]}
 VARIANTS = [
@@ -37,29 +38,49 @@ VARIANTS = [
     ("clean", 3, ", corrected"),
     ("clean", 4, ", corrected"),
 ]
+LONGER, FRESH = [("clean", 4, ""), ("disturbed", 3, "")], range(100, 105)
+"""What learns for 1,000,000 steps, and its seeds."""
 
 
 def main() -> None:
     """Train what is missing, and show what was learned."""
     folder = Path(sys.argv[1]).resolve()
-    parts, looks = [], {}
-    for kind, action_dim, corrected in VARIANTS:
-        name = f"{kind}, k = {action_dim}{corrected}"
-        demos = made(folder / kind, "collect_demos", [*TASK, *source(kind, folder)])
-        map = made(
-            folder / f"{kind}-{action_dim}.safetensors",
-            "train_map",
-            ["env=wam_grasp", f"demos.path={demos}", "map=nht", f"map.action_dim={action_dim}"],
-        )
-        told = [*LEARNER, *CORRECTIONS[corrected], f"map.file={map}"]
-        replayed = [f"demos.path={folder / 'clean'}", "algo.demos.transitions=10_000"]
-        runs = trained_runs(folder / name.replace(", ", "-").replace(" = ", ""), [*told, *replayed])
+    parts, longer, looks = [], [], {}
+    for variant in VARIANTS:
+        name, told = learner(variant, folder)
+        runs = trained_runs(folder / plain_name(name), [*told, "algo.total_frames=200_000"])
         parts.append(runs.assign(interface=name))
-        looks[name] = COLOURS[kind], "-" if action_dim == 4 else "--"
+        looks[name] = COLOURS[variant[0]], "-" if variant[1] == 4 else "--"
         save(pandas.concat(parts, ignore_index=True), OUT, "wam_grasp")
     several = pandas.concat(parts, ignore_index=True)
-    plain = [name for name in looks if "corrected" not in name]
-    plot(several[several["interface"].isin(plain)], OUT / "wam_grasp.png", looks)
+    uncorrected = [name for name in looks if "corrected" not in name]
+    plot(several[several["interface"].isin(uncorrected)], OUT / "wam_grasp.png", looks)
+    for variant in LONGER:
+        name, told = learner(variant, folder)
+        tested = ["algo.total_frames=1_000_000", "evaluation.final_episodes=200"]
+        runs = trained_runs(folder / f"{plain_name(name)}-longer", [*told, *tested], FRESH)
+        longer.append(runs.assign(interface=name))
+        save(pandas.concat(longer, ignore_index=True), OUT, "wam_grasp_longer")
+    plot(pandas.concat(longer, ignore_index=True), OUT / "wam_grasp_longer.png", looks)
+
+
+def learner(variant: tuple[str, int, str], folder: Path) -> tuple[str, list[str]]:
+    """The name and the settings of a variant, whose demonstrations and map are made first if need be."""
+    kind, action_dim, corrected = variant
+    demos = made(folder / kind, "collect_demos", [*TASK, *source(kind, folder)])
+    map = made(
+        folder / f"{kind}-{action_dim}.safetensors",
+        "train_map",
+        ["env=wam_grasp", f"demos.path={demos}", "map=nht", f"map.action_dim={action_dim}"],
+    )
+    replayed = [f"demos.path={folder / 'clean'}", "algo.demos.transitions=10_000"]
+    name = f"{kind}, k = {action_dim}{corrected}"
+    return name, [*LEARNER, *CORRECTIONS[corrected], f"map.file={map}", *replayed]
+
+
+def plain_name(name: str) -> str:
+    """Of a folder."""
+    return name.replace(", ", "-").replace(" = ", "")
 
 
 def source(kind: str, folder: Path) -> list[str]:
