@@ -13,7 +13,7 @@ from viser import SceneApi
 
 from nht.envs.arrays import Array
 from nht.recipes.live.session import Session
-from nht.recipes.live.stage import PosedNode
+from nht.recipes.live.stage import WORLD, PosedNode
 from nht.recipes.live.tool import Tool, angle_to_jacobian, rises
 
 AXIS_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A4FB5")
@@ -97,7 +97,7 @@ class Arrows:
     def _made(self, axis: int, length: float) -> PosedNode:
         thick = 0.018 * self._extent
         node = self._scene.add_arrows(
-            f"/basis/{axis}",
+            f"{WORLD}/basis/{axis}",
             _along_x(length),
             linear_rgb(AXIS_COLOURS[axis % len(AXIS_COLOURS)]),
             shaft_radius=0.45 * thick,

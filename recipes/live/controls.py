@@ -25,12 +25,14 @@ class Controls:
     Args:
         gui: of the viewer.
         session: what is steered.
+        goes_about: whether the robot can leave its place.
 
     Attributes:
         arrows, trail: whether these are to be drawn.
+        follow: whether a robot that goes about is to stay in sight.
     """
 
-    def __init__(self, gui: GuiApi, session: Session) -> None:
+    def __init__(self, gui: GuiApi, session: Session, *, goes_about: bool = False) -> None:
         self._gui, self._session = gui, session
         self._shown: dict[int, str] = {}
         self._values: list[float] = []
@@ -56,6 +58,7 @@ class Controls:
         self._on(speed, lambda now, value: setattr(now, "speed", float(value)))
         self._checkbox("Pause", False, lambda now, value: setattr(now, "paused", value))
         self._checkbox("Go on by itself", session.goes_on, lambda now, value: setattr(now, "goes_on", value))
+        self.follow = gui.add_checkbox("Follow the robot", True, visible=goes_about)
         with gui.add_folder("Record"):
             self._recording = gui.add_html("")
             self._record = gui.add_button("Record")

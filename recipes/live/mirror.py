@@ -95,6 +95,7 @@ class Mirror:
     Attributes:
         model: the simulator's own.
         data: the state when it was last looked at, with all that follows from it.
+        root: the robot's first body, if nothing keeps it in its place.
     """
 
     def __init__(self, source: Source) -> None:
@@ -103,7 +104,9 @@ class Mirror:
         self.data = mujoco.MjData(self.model)
         self._scene = mujoco.MjvScene(self.model, maxgeom=200)
         self._before = self._latest = np.array(self.data.qpos)
+        self.root = root_that_goes_about(self.model)
         self.jump()
+        self._home = np.zeros(3) if self.root is None else np.array(self.data.subtree_com[self.root])
 
     def jump(self) -> None:
         """Copy the state as it stands now, after a jump in time: there is no way from the one before."""
@@ -137,8 +140,28 @@ class Mirror:
         low, high = (places - reach).min(axis=0), (places + reach).max(axis=0)
         return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
+    def walked(self) -> Array:
+        """How far a robot that goes about has come from where it was first seen, ``(3,)`` [m]; along the floor."""
+        if self.root is None:
+            return np.zeros(3)
+        now = np.array(self.data.subtree_com[self.root])
+        return np.array([*(now - self._home)[:2], 0.0])
+
     def marks(self) -> list[mujoco.MjvGeom]:
         """What the task adds to the scene: goals, marks. Valid until the next call."""
         self._scene.ngeom = 0
         self._source.decorate(self._scene)
         return list(self._scene.geoms[: self._scene.ngeom])
+
+
+def root_that_goes_about(model: mujoco.MjModel) -> int | None:
+    """The first body of the robot, if it is free, or slides without limits; None for an arm on its base, or a cart."""
+    on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    moved = model.jnt_bodyid[model.actuator_trnid[on_joints, 0]]
+    for root in sorted(set(map(int, model.body_rootid[moved]))):
+        first = model.body_jntadr[root]
+        for joint in range(first, first + model.body_jntnum[root]):
+            kind, limited = model.jnt_type[joint], model.jnt_limited[joint]
+            if kind == mujoco.mjtJoint.mjJNT_FREE or (kind == mujoco.mjtJoint.mjJNT_SLIDE and not limited):
+                return root
+    return None

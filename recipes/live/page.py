@@ -17,7 +17,7 @@ from nht.recipes.live.controls import Controls
 from nht.recipes.live.door import LOCAL, Door
 from nht.recipes.live.mirror import Mirror
 from nht.recipes.live.session import POLICY, Session
-from nht.recipes.live.stage import Stage
+from nht.recipes.live.stage import WORLD, Stage
 from nht.recipes.live.tool import Tool
 
 TRAIL = 400
@@ -54,7 +54,7 @@ class Page:
         scene.configure_environment_map("studio", environment_intensity=LIGHT)
         self._stage = Stage(scene, mirror)
         self._arrows = Arrows(scene, mirror.moving_parts()[1])
-        self._controls = Controls(self._server.gui, session)
+        self._controls = Controls(self._server.gui, session, goes_about=mirror.root is not None)
         self._trail: deque[Any] = deque(maxlen=TRAIL)
         self._trail_node: Any = None
         self._motors = motor_names(mirror.model, session.base.action_spec.shape[-1])
@@ -98,7 +98,7 @@ class Page:
         basis = self._basis
         place = self._tool.position
         with self._server.atomic():
-            self._stage.update()
+            self._stage.update(self._controls.follow.value)
             self._arrows.update(basis if self._controls.arrows.value else None, place)
             self._draw_trail(place)
         if self._frames % WRITE_EVERY == 0:
@@ -124,7 +124,7 @@ class Page:
         segments = np.stack([points[:-1], points[1:]], axis=1)
         if self._trail_node is None:
             self._trail_node = self._server.scene.add_line_segments(
-                "/trail", segments, TRAIL_COLOUR, thickness=3.0, thickness_units="screen"
+                f"{WORLD}/trail", segments, TRAIL_COLOUR, thickness=3.0, thickness_units="screen"
             )
         else:
             self._trail_node.points = segments

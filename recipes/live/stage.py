@@ -15,12 +15,20 @@ from nht.recipes.live.shapes import G, Shape, shape_of_geom, shape_of_mark
 
 STILL = 1e-6
 """A smaller change of a position [m] or quaternion is not sent."""
+WORLD = "/world"
+"""The frame that all but the floor stands in."""
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+GRID, ABOVE = 40.0, 0.002
+"""Side of the grid, and its height above the floor [m]."""
 CHANGING = ("geom_size", "geom_pos", "geom_quat", "geom_rgba", "mat_rgba")
 """Arrays of the model that tasks change when an episode starts."""
 
 
 class Stage:
     """Draws a model body by body, with the marks of its task.
+
+    All of it stands in a frame, ``WORLD``, that can be moved: so a robot that goes about stays in sight. Its floor then
+    stays where it is, with a grid that shows how the robot moves over it.
 
     Args:
         scene: of the viewer.
@@ -30,26 +38,49 @@ class Stage:
     def __init__(self, scene: SceneApi, mirror: Mirror) -> None:
         self._scene, self._mirror = scene, mirror
         self._marks: list[tuple[Shape, PosedNode]] = []
+        self._world = PosedNode(scene.add_frame(WORLD, show_axes=False))
+        self._grid: PosedNode | None = None
         self._build()
 
     def _build(self) -> None:
         model = self._mirror.model
         self._bodies = {
-            body: PosedNode(self._scene.add_frame(f"/robot/{body}", show_axes=False))
+            body: PosedNode(self._scene.add_frame(f"{WORLD}/robot/{body}", show_axes=False))
             for body in sorted(set(map(int, model.geom_bodyid)))
         }
         for geom in range(model.ngeom):
             shape = shape_of_geom(model, geom)
-            if shape is not None:
-                name = f"/robot/{int(model.geom_bodyid[geom])}/{geom}"
-                node = add_shape(self._scene, name, shape)
-                PosedNode(node).move(model.geom_pos[geom], model.geom_quat[geom])
+            if shape is None:
+                continue
+            if self._mirror.root is not None and is_floor(model, geom):
+                self._build_floor(geom, shape)
+                continue
+            name = f"{WORLD}/robot/{int(model.geom_bodyid[geom])}/{geom}"
+            node = add_shape(self._scene, name, shape)
+            PosedNode(node).move(model.geom_pos[geom], model.geom_quat[geom])
         self._looks = self._model_looks()
         self.update()
 
-    def update(self) -> None:
-        """Place all bodies and marks as they stand in the mirror."""
+    def _build_floor(self, geom: int, shape: Shape) -> None:
         data = self._mirror.data
+        place = np.array(data.geom_xpos[geom])
+        node = add_shape(self._scene, f"/floor/{geom}", shape)
+        PosedNode(node).move(place, quaternion(data.geom_xmat[geom]))
+        self._floor = place + np.array([0.0, 0.0, ABOVE])
+        grid = self._scene.add_grid("/floor/grid", GRID, GRID, cell_size=1.0, section_size=1.0)
+        self._grid = PosedNode(grid)
+
+    def update(self, following: bool = True) -> None:
+        """Place all bodies and marks as they stand in the mirror.
+
+        Args:
+            following: whether a robot that goes about stays in sight.
+        """
+        data = self._mirror.data
+        way = self._mirror.walked() if following else np.zeros(3)
+        self._world.move(-way, UPRIGHT)
+        if self._grid is not None:  # its lines are a metre apart
+            self._grid.move(self._floor - np.fmod(way, 1.0), UPRIGHT)
         for body, placed in self._bodies.items():
             placed.move(data.xpos[body], data.xquat[body])
         self._update_marks()
@@ -74,11 +105,16 @@ class Stage:
             for _, placed in self._marks:
                 placed.node.remove()
             self._marks = [
-                (shape, PosedNode(add_shape(self._scene, f"/marks/{number}", shape)))
+                (shape, PosedNode(add_shape(self._scene, f"{WORLD}/marks/{number}", shape)))
                 for number, (shape, _, _) in enumerate(found)
             ]
         for (_, placed), (_, position, turn) in zip(self._marks, found, strict=True):
             placed.move(position, turn)
+
+
+def is_floor(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom is a plane that does not move."""
+    return bool(model.geom_type[geom] == G.mjGEOM_PLANE and model.body_weldid[model.geom_bodyid[geom]] == 0)
 
 
 class PosedNode:

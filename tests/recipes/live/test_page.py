@@ -3,6 +3,7 @@
 import json
 import urllib.request
 
+import numpy as np
 import pytest
 from websockets.sync.client import connect
 
@@ -82,6 +83,39 @@ def test_pictures_follow_episodes_recording_and_other_interfaces(opened, tmp_pat
     session.post(lambda now: now.save())
     frames(session, page, 1)
     assert (tmp_path / "by-hand").exists()
+
+
+def test_a_robot_that_runs_away_stays_in_sight(tmp_path):
+    """It stands where it stood, and the floor's grid passes beneath it; unfollowed, it leaves."""
+    with open_page(config("env=half_cheetah", "port=0", f"out={tmp_path / 'by-hand'}")) as (session, page):
+        stage, mirror = page._stage, page._mirror
+        page.show()
+        root, grid = mirror.root, np.array(stage._grid.node.position) + mirror.walked()
+
+        def shown():
+            return (np.array(stage._world.node.position) + mirror.data.subtree_com[root])[:2]
+
+        start = shown()
+        session.commands.ask([1.0, 1.0, 1.0, -1.0, -1.0, -1.0], "a")
+        for _ in range(40):
+            session.step()
+            page.show()
+        gone = mirror.walked()
+        assert np.abs(gone).max() > 0.05
+        assert np.allclose(shown(), start, atol=1e-4)
+        assert np.allclose(grid - stage._grid.node.position, np.fmod(gone, 1.0), atol=1e-4)
+        page._controls.follow.value = False
+        page.show()
+        assert np.allclose(shown() - start, gone[:2], atol=1e-4)
+        assert np.allclose(stage._grid.node.position, grid, atol=1e-4)
+
+
+def test_an_arm_has_no_grid_and_nothing_to_follow(opened):
+    _, page = opened
+    page.show()
+    assert page._stage._grid is None
+    assert not page._controls.follow.visible
+    assert not np.any(page._stage._world.node.position)
 
 
 def test_the_bars_show_every_motor_and_tell_the_axes(opened):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nht.recipes.live.basis import present_basis
-from nht.recipes.live.mirror import Mirror
+from nht.recipes.live.mirror import Mirror, root_that_goes_about
 from nht.recipes.live.opening import open_session
 from nht.recipes.live.shapes import G, capsule, shape_of_geom
 from nht.recipes.live.tool import Tool, angle_to_jacobian, rises
@@ -162,3 +162,22 @@ def test_robots_of_all_suites_can_be_looked_at(words):
     assert basis.motion.shape == (6, session.interface.action_dim)
     assert np.abs(basis.motion).max() > 0
     session.close()
+
+
+@pytest.mark.parametrize(
+    ("env", "root"),
+    [
+        (["env=half_cheetah"], "torso"),
+        (["env=ant"], "torso"),
+        (["env=gymnasium", "env.name=Swimmer-v5"], "torso"),
+        (["env=wam_grasp"], None),
+        (["env=gymnasium", "env.name=InvertedPendulum-v5"], None),
+        (["env=gymnasium", "env.name=Pusher-v5"], None),
+    ],
+)
+def test_what_can_run_away_is_known(env, root):
+    opened = open_session(config(*env))
+    model, found = opened.mirror.model, opened.mirror.root
+    opened.session.close()
+    assert found == root_that_goes_about(model)
+    assert (None if found is None else model.body(found).name) == root
