@@ -169,5 +169,7 @@ def test_settings_that_are_refused(settings: dict[str, Any], message: str) -> No
 def test_an_algorithm_without_cloning() -> None:
     from nht.recipes.agents.sac import SAC
 
-    with pytest.raises(ValueError, match=r"Key 'cloning' not in 'ReplayDemosConfig'.*'transitions', 'share'"):
+    with pytest.raises(
+        ValueError, match=r"Key 'cloning' not in 'ReplayDemosConfig'.*'transitions', 'cloning_start', 'share'"
+    ):
         configure(SAC, "sac", ["algo.demos.cloning=1"])
