@@ -39,9 +39,7 @@ class OffPolicyConfig(AlgoConfig):
     n_steps: int = 1  # rewards that a target adds up before it trusts the critics, within a collected batch
     polyak: float = 0.995  # share of the old target network that stays at each move
     pessimism: float = 0.8  # the critics start at this times the lowest return that is possible
-    observation_norm: bool = (
-        True  # networks see observations by their running mean and deviation, not as they are
-    )
+    observation_norm: bool = True  # networks see observations in units of their running deviation
     observation_clip: float = 5.0  # of the normalised observation
     layer_norm: str = "none"  # of hidden layers, before each ReLU: none, critic or all
     bfloat16: bool = False  # the precision of hidden layers' matrix products; weights stay float32
