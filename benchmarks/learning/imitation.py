@@ -18,9 +18,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import demos_in_replay
 import pandas
 
-import demos_in_replay
 from nht.recipes.study.figures import colour
 from populations import ARMS, plot, save, trained_runs
 
