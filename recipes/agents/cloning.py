@@ -76,7 +76,8 @@ class Cloning:
         error = (action - batch["action"]).square().sum(-1)
         if self._filter:
             with torch.no_grad():
-                error = error * (critic(batch["action"]) > value)
+                passes = critic(batch["action"]) > value
+            error = error * passes
         return self.weight * mean_over(batch, (batch["demonstrated"] * error).unsqueeze(-1))
 
 

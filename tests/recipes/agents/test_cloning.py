@@ -96,6 +96,17 @@ def test_the_filter_passes_some_and_stops_some() -> None:
     torch.testing.assert_close(found, 2.0 * (errors[0] + errors[2]) / SHOWN)
 
 
+def test_what_passes_the_filter_is_learned_and_nothing_else() -> None:
+    steps, action = batch(), torch.zeros(SIZE, 3, requires_grad=True)
+    better = torch.tensor([1.0, -1.0, 1.0, -1.0, 0.0])
+    worth = torch.cat([torch.ones(SIZE - SHOWN), better])
+    Cloning(2.0, None, True).loss(steps, action, torch.zeros(SIZE), lambda _: worth).backward()
+    expected = -4.0 * steps["action"] / SHOWN
+    expected[torch.cat([torch.zeros(SIZE - SHOWN), better]) <= 0] = 0.0
+    assert action.grad is not None
+    torch.testing.assert_close(action.grad, expected)
+
+
 @pytest.mark.parametrize("q_filter", [False, True])
 def test_of_several_learners_it_is_that_of_each(q_filter: bool) -> None:
     algo = DDPGConfig(hidden=[16])
