@@ -6,7 +6,7 @@ PPO through raw torques, SVD's plane and NHT (k = 2), the latter two with and wi
    learning, after 307,200, 614,400 and 1,003,520 steps.
 2. *Trials*: eight settings for each interface, two seeds each, 307,200 steps. Raw torques have one setting, the action
    scale; SVD two, all pairs of which are tried; NHT four of two levels each, of which every other combination is tried,
-   so that each level is seen four times and no pair of settings hides another.
+   so that each level is seen four times and what a pair of settings does together is not taken for what one does.
 3. Of every setting the level that did better in the mean is taken to 1,003,520 steps.
 
 Each stage trains the seeds and settings of an interface as one population. Writes trials, curves, a table and a figure

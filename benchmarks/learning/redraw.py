@@ -32,6 +32,7 @@ def main() -> None:
     sys.path += [str(RESULTS.parent / folder) for folder in ("learning", "speed")]  # scripts, no package
     import batch_scaling
     import demos_in_replay
+    import imitation
     import population
 
     import populations
@@ -46,6 +47,8 @@ def main() -> None:
     for task in demos_in_replay.TASKS:
         curves = pandas.read_csv(demos_in_replay.OUT / f"{task}.csv")
         populations.plot(curves, demos_in_replay.OUT / f"{task}.png", demos_in_replay.LOOKS)
+    curves = pandas.read_csv(imitation.OUT / "wam_grasp.csv")
+    populations.plot(curves, imitation.OUT / "wam_grasp.png", imitation.LOOKS)
     population.draw(pandas.read_csv(population.OUT / "rounds.csv"))
     scaling = pandas.read_csv(batch_scaling.RESULTS.with_suffix(".csv"), comment="#")
     batch_scaling.plot(scaling.to_dict("records"), "half_cheetah")
