@@ -38,6 +38,12 @@ VARIANTS = [
     ("clean", 3, ", corrected"),
     ("clean", 4, ", corrected"),
 ]
+LOOKS = {
+    f"{kind}, k = {action_dim}": (COLOURS[kind], "-" if action_dim == 4 else "--")
+    for kind, action_dim, corrected in VARIANTS
+    if not corrected
+}
+"""Of the curves; corrections, which do not pay, are in the table only."""
 LONGER, FRESH = [("clean", 4, ""), ("disturbed", 3, "")], range(100, 105)
 """What learns for 1,000,000 steps, and its seeds."""
 
@@ -45,23 +51,25 @@ LONGER, FRESH = [("clean", 4, ""), ("disturbed", 3, "")], range(100, 105)
 def main() -> None:
     """Train what is missing, and show what was learned."""
     folder = Path(sys.argv[1]).resolve()
-    parts, longer, looks = [], [], {}
+    parts, longer = [], []
     for variant in VARIANTS:
         name, told = learner(variant, folder)
         runs = trained_runs(folder / plain_name(name), [*told, "algo.total_frames=200_000"])
         parts.append(runs.assign(interface=name))
-        looks[name] = COLOURS[variant[0]], "-" if variant[1] == 4 else "--"
         save(pandas.concat(parts, ignore_index=True), OUT, "wam_grasp")
-    several = pandas.concat(parts, ignore_index=True)
-    uncorrected = [name for name in looks if "corrected" not in name]
-    plot(several[several["interface"].isin(uncorrected)], OUT / "wam_grasp.png", looks)
+    draw(pandas.concat(parts, ignore_index=True), "wam_grasp")
     for variant in LONGER:
         name, told = learner(variant, folder)
         tested = ["algo.total_frames=1_000_000", "evaluation.final_episodes=200"]
         runs = trained_runs(folder / f"{plain_name(name)}-longer", [*told, *tested], FRESH)
         longer.append(runs.assign(interface=name))
         save(pandas.concat(longer, ignore_index=True), OUT, "wam_grasp_longer")
-    plot(pandas.concat(longer, ignore_index=True), OUT / "wam_grasp_longer.png", looks)
+    draw(pandas.concat(longer, ignore_index=True), "wam_grasp_longer")
+
+
+def draw(curves: pandas.DataFrame, name: str) -> None:
+    """The figure beside the rows of that name."""
+    plot(curves[curves["interface"].isin(LOOKS)], OUT / f"{name}.png", LOOKS)
 
 
 def learner(variant: tuple[str, int, str], folder: Path) -> tuple[str, list[str]]:

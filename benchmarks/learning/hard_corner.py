@@ -33,24 +33,32 @@ CORNER = [
 LEARNER = [*CORNER, *ARMS, "map.action_scale=1", "algo.total_frames=160_000"]
 INTERFACES = ("nht", "svd", "scl", "laser", "jacobian", "raw")
 WAYS = {"": ([], ":"), ", demonstrations": (["algo.demos.transitions=10_000"], "-")}
+LOOKS = {
+    f"{interface}{way}": (colour(interface), line)
+    for interface in INTERFACES
+    for way, (_, line) in WAYS.items()
+}
 
 
 def main() -> None:
     """Train what is missing, and show what was learned."""
     folder = Path(sys.argv[1]).resolve()
     demos = made(folder / "demos", "collect_demos", [*CORNER, "demos.transitions=20_000"])
-    parts, looks = [], {}
+    parts = []
     for interface in sys.argv[2:] or INTERFACES:
-        for way, (more, line) in WAYS.items():
+        for way, (more, _) in WAYS.items():
             run = folder / f"{interface}{way.replace(', ', '-')}"
             driven = interface_of(interface, demos, folder)
             runs = trained_runs(run, [*LEARNER, *driven, f"demos.path={demos}", *more])
             parts.append(runs.assign(interface=f"{interface}{way}"))
-            looks[f"{interface}{way}"] = colour(interface), line
-            curves = pandas.concat(parts, ignore_index=True)
-            save(curves, OUT, "wam_wipe")
-    plot(curves, OUT / "curves.png", looks)
-    violations(curves, OUT / "violations.png", looks)
+            save(pandas.concat(parts, ignore_index=True), OUT, "wam_wipe")
+    draw(pandas.concat(parts, ignore_index=True))
+
+
+def draw(curves: pandas.DataFrame) -> None:
+    """Both figures."""
+    plot(curves, OUT / "curves.png", LOOKS)
+    violations(curves, OUT / "violations.png")
 
 
 def interface_of(kind: str, demos: Path, folder: Path) -> list[str]:
@@ -62,14 +70,14 @@ def interface_of(kind: str, demos: Path, folder: Path) -> list[str]:
 
 
 @style()
-def violations(curves: pandas.DataFrame, file: Path, looks: dict[str, tuple[str, str]]) -> None:
+def violations(curves: pandas.DataFrame, file: Path) -> None:
     """Success at the end against the share of training episodes that violated the constraint: seeds, and means."""
     figure, axes = plt.subplots(figsize=(0.75 * PAGE, 0.45 * PAGE), layout="constrained")
     for name, group in curves.groupby("interface", sort=False):
         seeds = group.groupby("seed")
         broken, success = seeds[trained(FAILURE)].mean(), group[group[FRAMES] == group[FRAMES].max()]
         success = success.set_index("seed")[tested(SUCCESS)]
-        own, line = looks[str(name)]
+        own, line = LOOKS[str(name)]
         face = own if line == "-" else "none"
         axes.scatter(broken, success, s=14, facecolors=face, edgecolors=own, alpha=0.5)
         low, high = interval(success.to_numpy())

@@ -32,6 +32,8 @@ def main() -> None:
     sys.path += [str(RESULTS.parent / folder) for folder in ("learning", "speed")]  # scripts, no package
     import batch_scaling
     import demos_in_replay
+    import grasp_ceiling
+    import hard_corner
     import imitation
     import population
 
@@ -49,6 +51,9 @@ def main() -> None:
         populations.plot(curves, demos_in_replay.OUT / f"{task}.png", demos_in_replay.LOOKS)
     curves = pandas.read_csv(imitation.OUT / "wam_grasp.csv")
     populations.plot(curves, imitation.OUT / "wam_grasp.png", imitation.LOOKS)
+    for name in ("wam_grasp", "wam_grasp_longer"):
+        grasp_ceiling.draw(pandas.read_csv(grasp_ceiling.OUT / f"{name}.csv"), name)
+    hard_corner.draw(pandas.read_csv(hard_corner.OUT / "wam_wipe.csv"))
     population.draw(pandas.read_csv(population.OUT / "rounds.csv"))
     scaling = pandas.read_csv(batch_scaling.RESULTS.with_suffix(".csv"), comment="#")
     batch_scaling.plot(scaling.to_dict("records"), "half_cheetah")
