@@ -48,6 +48,19 @@ def test_a_stacked_network_is_each_network_on_its_own_rows(learners, size, hidde
         torch.testing.assert_close(found, network(rows), rtol=1e-5, atol=1e-5)
 
 
+def test_tanh_and_its_gradient_are_those_of_each_network():
+    torch.manual_seed(0)
+    inputs = torch.cat([torch.linspace(-12, 12, 4001), torch.tensor([-1e30, 0.0, 1e30])])
+    inputs = inputs.repeat(2, 1).requires_grad_()
+    cotangent = torch.rand_like(inputs)
+    found = stacked([nn.Sequential(nn.Tanh()), nn.Sequential(nn.Tanh())])(inputs)
+    (gradient,) = torch.autograd.grad(found, inputs, cotangent)
+    exact = inputs.detach().double().requires_grad_()
+    (exactly,) = torch.autograd.grad(exact.tanh(), exact, cotangent.double())
+    torch.testing.assert_close(found.double(), exact.tanh(), rtol=0, atol=2e-7)
+    torch.testing.assert_close(gradient.double(), exactly, rtol=0, atol=4e-7)
+
+
 @given(learners=st.integers(1, 4), hidden=st.lists(SIZES, max_size=2), seed=st.integers(0, 99))
 def test_the_state_of_a_learner_is_that_of_its_network(learners, hidden, seed):
     own = networks(learners, 3, hidden, 2, seed=seed)
