@@ -230,8 +230,8 @@ def _correlations(results: SearchResults, out: Path) -> Figure:
             )
     canvas.colorbar(picture, label="rank correlation with the score")
     text = (
-        "Spearman's rank correlation of each hyperparameter with a configuration's score; its square is the share of "
-        "variance in ranks that goes with it. Empty: not drawn, or every score is the same. With few configurations "
-        "large values come by chance."
+        "Spearman's rank correlation of each hyperparameter, and of its map's error where that was recorded, with a "
+        "configuration's score; its square is the share of variance in ranks that goes with it. Empty: not drawn, or "
+        "every score is the same. With few configurations large values come by chance."
     )
     return _save(canvas, out, Figure("correlations", "What the score depends on", text))

@@ -70,23 +70,29 @@ class SearchResults:
         return number, (fresh if len(fresh) else of_it[of_it["stage"] == "search"]), bool(len(fresh))
 
     def configurations(self, interface: str) -> pandas.DataFrame:
-        """A row per configuration of an interface: its hyperparameters and the mean of its scores."""
+        """A row per configuration of an interface: its hyperparameters, its maps' error if known, its mean score."""
         runs = self.stage("search")
         grouped = runs[runs["interface"] == interface].groupby("configuration")
-        return grouped[self.parameters].first().assign(score=grouped["score"].mean())
+        means = [name for name in (MAP_ERROR, "score") if name in runs.columns]
+        return grouped[self.parameters].first().join(grouped[means].mean())
 
     def correlations(self) -> pandas.DataFrame:
-        """Spearman's rank correlation of each numeric hyperparameter with the configurations' scores, by interface."""
+        """Spearman's rank correlation of each numeric hyperparameter with the configurations' scores, by interface.
+
+        Below them that of the maps' held-out error, if it is known.
+        """
         table: dict[str, dict[str, float]] = {}
         for interface in self.interfaces:
             means = self.configurations(interface)
-            numeric = means[self.parameters].select_dtypes("number").dropna(axis="columns", how="all")
+            causes = means.drop(columns="score")
+            numeric = causes.select_dtypes("number").dropna(axis="columns", how="all")
             table[interface] = {
                 str(name): float(stats.spearmanr(values, means["score"]).statistic)
                 for name, values in numeric.items()
                 if values.nunique() > 1 and means["score"].nunique() > 1
             }
-        drawn = [name for name in self.parameters if any(name in column for column in table.values())]
+        known = [*self.parameters, MAP_ERROR]
+        drawn = [name for name in known if any(name in column for column in table.values())]
         return pandas.DataFrame(table).reindex(drawn)
 
 

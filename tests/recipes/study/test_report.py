@@ -85,6 +85,14 @@ def test_correlations_by_interface():
     assert np.isnan(table.loc["map.learning_rate", "raw"])
 
 
+def test_how_well_a_map_fits_is_seen_beside_what_was_drawn():
+    rows = toy_search.rows()
+    rows["map_error"] = (1 - rows["algo.gamma"]).where(rows["interface"] == "nht")
+    table = SearchResults.of(rows).correlations()
+    assert table.loc["map_error", "nht"] == pytest.approx(-table.loc["algo.gamma", "nht"])
+    assert np.isnan(table.loc["map_error", "raw"])
+
+
 @pytest.mark.parametrize("shape", [(1, 3), (3, 1), (1, 1)])
 def test_one_configuration_or_one_seed_is_enough(tmp_path, shape):
     folder = write(tmp_path / "search", toy_search.rows(*shape, best_seeds=0))
