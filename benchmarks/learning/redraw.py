@@ -42,7 +42,7 @@ def main() -> None:
     for name, (metric, title, lines) in CURVES.items():
         curves = pandas.read_csv(RESULTS / name / "curves.csv")
         plot(curves, metric, title, RESULTS / name / f"{metric}.png", lines)
-    for name in ("search_wam_wipe", "search_wam_grasp"):
+    for name in ("search_wam_wipe", "search_wam_grasp", "search_wam_grasp_1m"):
         write_report(RESULTS / name / "rows.csv", RESULTS / name / "report", "")
     for table in sorted((RESULTS / "compare_maps").glob("*/table.csv")):
         plot_errors(pandas.read_csv(table), table.with_name("error.png"))

@@ -27,7 +27,7 @@ COLUMNS = (
 """Columns of ``rows.csv``; further columns are costs, where they were recorded, and hyperparameters."""
 
 CORE_SECONDS, MAP_ERROR = "core_seconds", "map_error"
-"""Processor time of the whole run [s], and held-out error of the map that it trained; the same in all its rows."""
+"""Processor time of a run's share of the process that ended it [s], and held-out error of the map that it trained; the same in all its rows."""
 
 CHOICES = {
     "metric": (SUCCESS, RETURN),
