@@ -27,7 +27,8 @@ COLUMNS = (
 """Columns of ``rows.csv``; further columns are costs, where they were recorded, and hyperparameters."""
 
 CORE_SECONDS, MAP_ERROR = "core_seconds", "map_error"
-"""Processor time of a run's share of the process that ended it [s], and held-out error of the map that it trained; the same in all its rows."""
+"""A run's share of the processor time of the process that ended it [s], and held-out error of the map that it trained;
+the same in all its rows."""
 
 CHOICES = {
     "metric": (SUCCESS, RETURN),
