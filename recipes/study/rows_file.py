@@ -93,7 +93,7 @@ def _check_values(file: Path, rows: pandas.DataFrame) -> None:
     for name in COUNTS:
         if not pandas.api.types.is_integer_dtype(rows[name]) or (rows[name] < 0).any():
             raise ValueError(f"{file}: {name} must be a count in every row.")
-    for name in NUMBERS:
+    for name in rows.columns.intersection([*NUMBERS, MAP_ERROR]):
         if not pandas.api.types.is_numeric_dtype(rows[name]) or np.isinf(rows[name].astype(float)).any():
             raise ValueError(f"{file}: {name} must be a finite number, or missing, in every row.")
     if (rows[FRAMES] % 1 > 0).any() or (rows[FRAMES] < 0).any():

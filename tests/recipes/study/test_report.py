@@ -111,6 +111,7 @@ def test_bad_rows(tmp_path):
         ),
         ("lacking", rows.drop(columns=["seed", "reason"]), r"lacks the columns \['seed', 'reason'\]"),
         ("empty", rows[:0], "has no rows: the search has not finished a run yet"),
+        ("unfit", rows.assign(map_error="close"), "map_error must be a finite number, or missing"),
     ]:
         folder = write(tmp_path / name, broken)
         with pytest.raises(ValueError, match=message):
