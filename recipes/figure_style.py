@@ -80,6 +80,7 @@ def save_figure(figure: Canvas, path: str | Path, *more: str) -> None:
     with style():
         for suffix in dict.fromkeys([path.suffix, ".pdf", *more]):
             figure.savefig(path.with_suffix(suffix), metadata=SAME.get(suffix))
+            figure.set_layout_engine("none")  # what was placed for the first file stays there in the others
     plt.close(figure)
 
 

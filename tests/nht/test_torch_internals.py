@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 from torch import Tensor, nn
 
@@ -13,6 +14,7 @@ class Double(nn.Module):
         return 2 * value
 
 
+@pytest.mark.slow  # compiles
 def test_write_machine_code_gives_back_its_metadata(tmp_path: Path) -> None:
     path = tmp_path / "double.pt2"
     write_machine_code(torch.export.export(Double(), (torch.ones(3),)), path, {"map": "a description"})

@@ -2,10 +2,12 @@
 
 import multiprocessing
 import os
+import signal
 import tempfile
 import time
 
 import tiny_runs
+from nht.recipes.run import checkpoints
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(["killed_runs", "killed_ranks", "nht.recipes.ddpg", "nht.recipes.ppo"])
@@ -32,6 +34,27 @@ def start(algorithm, folder, overrides, barrier=None):
     process = CONTEXT.Process(target=train, args=(algorithm, folder, overrides, barrier))
     process.start()
     return process
+
+
+def kill_at_checkpoint(number, algorithm, folder, overrides):
+    """Kill it at the moment when its first, second ... checkpoint is written but not yet in its place."""
+    process = CONTEXT.Process(target=_train_to_checkpoint, args=(number, algorithm, folder, overrides))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL, words(folder)
+
+
+def _train_to_checkpoint(number, algorithm, folder, overrides):
+    publish, written = checkpoints.publish, []
+
+    def kill(*paths):
+        written.append(paths)
+        if len(written) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return publish(*paths)
+
+    checkpoints.publish = kill
+    train(algorithm, folder, overrides)
 
 
 def finish(algorithm, folder, overrides):

@@ -6,8 +6,10 @@ import importlib
 import runpy
 import shutil
 import sys
+from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -47,6 +49,9 @@ SHORTER = {"algo.demos.transitions": "100", "seeds": "2", "action_dims": "[2]"}
 """Settings that stay where a page has them, with other values."""
 
 
+Main = Callable[[Any], object]
+
+
 class Composed(Exception):  # noqa: N818 - no error: what a recipe would have been called with
     """Ends a recipe where its work would begin."""
 
@@ -61,13 +66,10 @@ def compose(module: str, words: list[str]) -> object:
     def keep(config: object) -> None:
         raise Composed(config)
 
-    with pytest.MonkeyPatch.context() as patch:
-        true_launch = launching.launch
-        patch.setattr(launching, "launch", lambda _, *how, **more: true_launch(keep, *how, **more))
-        try:
-            _start(module, words)
-        except Composed as composed:
-            return composed.args[0]
+    try:
+        _start(module, words, lambda _: keep)
+    except Composed as composed:
+        return composed.args[0]
     raise AssertionError(f"{module} did not start.")
 
 
@@ -83,12 +85,19 @@ def run(module: str, words: list[str]) -> None:
             kept.append(f"{key}={SHORTER[key]}" if key in SHORTER else word)
     given = {word.partition("=")[0] for word in kept}
     words = [*kept, *(word for word in budget if word.partition("=")[0] not in given)]
-    config = compose(module, words)
-    for place in (config.run.folder if isinstance(config, Training) else None, getattr(config, "out", None)):
-        if place and name not in ("report", "export_map", "inspect_demos"):
-            shutil.rmtree(place, ignore_errors=True)
-            Path(place).unlink(missing_ok=True)
-    _start(module, words)
+
+    def over_what_is_there(main: Main) -> Main:
+        def clear_and_run(config: Any) -> object:
+            folder = config.run.folder if isinstance(config, Training) else None
+            for place in (folder, getattr(config, "out", None)):
+                if place and name not in ("report", "export_map", "inspect_demos"):
+                    shutil.rmtree(place, ignore_errors=True)
+                    Path(place).unlink(missing_ok=True)
+            return main(config)
+
+        return clear_and_run
+
+    _start(module, words, over_what_is_there)
 
 
 def prepare(outside: Path) -> None:
@@ -118,10 +127,13 @@ def prepare(outside: Path) -> None:
         file["terminals"] = np.arange(40) % 20 == 19
 
 
-def _start(module: str, words: list[str]) -> None:
+def _start(module: str, words: list[str], changed: Callable[[Main], Main] = lambda main: main) -> None:
+    """Start a recipe as the command line does, with another main function."""
     kept = sys.modules.pop(module, None)  # else runpy warns that it is there already
+    launch = launching.launch
     try:
-        with _arguments([module, *words]):
+        with _arguments([module, *words]), pytest.MonkeyPatch.context() as patch:
+            patch.setattr(launching, "launch", lambda main, *how, **more: launch(changed(main), *how, **more))
             runpy.run_module(module, run_name="__main__", alter_sys=True)
     finally:
         if kept is not None:

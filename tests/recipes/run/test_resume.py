@@ -13,7 +13,7 @@ import pytest
 import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
-import fresh_process
+import killed_runs
 import tiny_runs
 from nht.recipes.run import checkpoints, folder
 from nht.recipes.run.checkpoint_file import CheckpointFile
@@ -43,27 +43,9 @@ def assert_same(folder: Path, metrics: pandas.DataFrame, whole) -> None:
     assert weights[0] == weights[1]
 
 
-def train_and_be_killed(algorithm: str, folder: Path, checkpoint: int) -> None:
-    """Train, and be killed at the moment when a checkpoint is written but not yet in its place."""
-    publish, written = checkpoints.publish, []
-
-    def kill(*paths):
-        written.append(paths)
-        if len(written) == checkpoint:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return publish(*paths)
-
-    checkpoints.publish = kill
-    train(algorithm, folder)
-
-
 @pytest.mark.parametrize("checkpoint", [1, 2])
 def test_killed_while_writing_a_checkpoint(whole, checkpoint, tmp_path):
-    places, folder = [str(Path(__file__).parent), str(Path(tiny_runs.__file__).parent)], tmp_path / "run"
-    code = f"import sys; sys.path[:0] = {places}; import test_resume; from pathlib import Path; "
-    code += f"test_resume.train_and_be_killed({whole[0]!r}, Path({str(folder)!r}), {checkpoint})"
-    process = fresh_process.run(code)
-    assert process.returncode == -signal.SIGKILL, process.stderr
+    killed_runs.kill_at_checkpoint(checkpoint, whole[0], tmp_path / "run", SETTINGS)
     written = tmp_path / "run" / "checkpoints"
     assert len(list(written.glob("checkpoint-*"))) == checkpoint - 1
     assert list(written.glob(".*"))
@@ -106,20 +88,38 @@ def test_a_run_that_is_whole_is_left_as_it_is(whole, resume, monkeypatch, capsys
     assert "policy.safetensors" in capsys.readouterr().out
 
 
-def broken_off(whole, folder: Path) -> list[Path]:
-    """A run that broke off a moment before its end; its checkpoints, oldest first."""
+def break_off(algorithm: str, folder: Path) -> list[Path]:
+    """A run that breaks off a moment before its end; its checkpoints, oldest first."""
     log = RunFolder.log
 
-    def break_off(self, frames, row):
+    def end(self, frames, row):
         if frames == 600:
             raise KeyboardInterrupt
         log(self, frames, row)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(RunFolder, "log", break_off)
+        patched.setattr(RunFolder, "log", end)
         with pytest.raises(KeyboardInterrupt):
-            train(whole[0], folder)
+            train(algorithm, folder)
+    return checkpoints_in(folder)
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
     return sorted((folder / "checkpoints").glob("checkpoint-*"))
+
+
+@pytest.fixture(scope="module")
+def once_broken_off(whole, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(whole[0]) / "broken off"
+    break_off(whole[0], folder)
+    return folder
+
+
+@pytest.fixture
+def broken_off(once_broken_off, tmp_path):
+    """The checkpoints of a run in ``tmp_path / "run"`` that broke off."""
+    shutil.copytree(once_broken_off, tmp_path / "run")
+    return checkpoints_in(tmp_path / "run")
 
 
 def cut_short(checkpoint: Path) -> None:
@@ -135,8 +135,8 @@ def flip_a_bit(checkpoint: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [cut_short, flip_a_bit])
-def test_a_broken_checkpoint_is_passed_over(whole, damage, tmp_path):
-    _, newest = broken_off(whole, tmp_path / "run")
+def test_a_broken_checkpoint_is_passed_over(whole, broken_off, damage, tmp_path):
+    _, newest = broken_off
     damage(newest)
     with pytest.warns(UserWarning, match=rf"{newest} cannot be read and is passed over"):
         metrics = train(whole[0], tmp_path / "run", "run.resume=true")
@@ -153,7 +153,7 @@ def save_as_torchrl(self: checkpoints.Checkpoints, frames: int) -> None:
 def test_checkpoints_of_earlier_versions_are_read_without_unpickling(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(checkpoints.Checkpoints, "save", save_as_torchrl)
-        _, newest = broken_off(whole, tmp_path / "run")
+        _, newest = break_off(whole[0], tmp_path / "run")
     with zipfile.ZipFile(newest) as archive:
         assert any(name.endswith("prefetch.pkl") for name in archive.namelist()) == (whole[0] != "ppo")
 
@@ -187,16 +187,16 @@ def change_weights(members: dict[str, bytes]) -> None:
     members[name] = members[name][:-1] + bytes([members[name][-1] ^ 1])
 
 
-def test_memory_mapped_parts_that_were_changed_are_noticed(whole, tmp_path):
-    _, newest = broken_off(whole, tmp_path / "run")
+def test_memory_mapped_parts_that_were_changed_are_noticed(whole, broken_off, tmp_path):
+    _, newest = broken_off
     rewritten(newest, change_weights)
     with pytest.warns(UserWarning, match=r"checkpoint-\d+.*was changed since it was written: its checksum"):
         metrics = train(whole[0], tmp_path / "run", "run.resume=true")
     assert_same(tmp_path / "run", metrics, whole)
 
 
-def test_networks_that_are_not_finite_are_refused(whole, tmp_path):
-    for checkpoint in broken_off(whole, tmp_path / "run"):
+def test_networks_that_are_not_finite_are_refused(whole, broken_off, tmp_path):
+    for checkpoint in broken_off:
         with CheckpointFile(checkpoint) as file:
             states = file.read()
         name = next(name for name in states["loss"] if name.endswith("weight"))
@@ -207,8 +207,7 @@ def test_networks_that_are_not_finite_are_refused(whole, tmp_path):
         train(whole[0], tmp_path / "run", "run.resume=true")
 
 
-def test_stray_files_are_passed_over(whole, tmp_path):
-    broken_off(whole, tmp_path / "run")
+def test_stray_files_are_passed_over(whole, broken_off, tmp_path):
     folder = tmp_path / "run" / "checkpoints"
     for name in ("notes", "checkpoint-000000000300 (1).torchrl", "checkpoint-last", ".mine"):
         (folder / name).write_text("hello")
@@ -217,8 +216,8 @@ def test_stray_files_are_passed_over(whole, tmp_path):
     assert (folder / ".mine").exists()
 
 
-def test_nothing_but_broken_checkpoints(whole, tmp_path):
-    for checkpoint in broken_off(whole, tmp_path / "run"):
+def test_nothing_but_broken_checkpoints(whole, broken_off, tmp_path):
+    for checkpoint in broken_off:
         cut_short(checkpoint)
     with (
         pytest.warns(UserWarning, match="cannot be read"),
@@ -227,8 +226,7 @@ def test_nothing_but_broken_checkpoints(whole, tmp_path):
         train(whole[0], tmp_path / "run", "run.resume=true")
 
 
-def test_a_row_cut_short_is_written_again(whole, tmp_path):
-    broken_off(whole, tmp_path / "run")
+def test_a_row_cut_short_is_written_again(whole, broken_off, tmp_path):
     with (tmp_path / "run" / "metrics.csv").open("a") as file:
         file.write("30")  # of 300,0.0,...
     assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
@@ -254,8 +252,7 @@ def test_a_run_that_is_whole_says_so_and_stays(whole, tmp_path, capsys):
     assert after == {path: before[path] for path in after}
 
 
-def test_the_clock_goes_on(whole, tmp_path):
-    broken_off(whole, tmp_path / "run")
+def test_the_clock_goes_on(whole, broken_off, tmp_path):
     metrics = tmp_path / "run" / "metrics.csv"
     pandas.read_csv(metrics).assign(seconds=1000.0).to_csv(metrics, index=False)
     train(whole[0], tmp_path / "run", "run.resume=true")
@@ -263,9 +260,7 @@ def test_the_clock_goes_on(whole, tmp_path):
 
 
 @pytest.mark.parametrize("warned", [True, False])
-def test_a_full_disk(whole, tmp_path, monkeypatch, warned):
-    broken_off(whole, tmp_path / "run")
-
+def test_a_full_disk(whole, broken_off, tmp_path, monkeypatch, warned):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -283,8 +278,7 @@ def test_a_full_disk(whole, tmp_path, monkeypatch, warned):
     assert_same(tmp_path / "run", train(whole[0], tmp_path / "run", "run.resume=true"), whole)
 
 
-def test_a_run_without_a_checkpoint_cannot_go_on_but_begin_anew(whole, tmp_path):
-    broken_off(whole, tmp_path / "run")
+def test_a_run_without_a_checkpoint_cannot_go_on_but_begin_anew(whole, broken_off, tmp_path):
     shutil.rmtree(tmp_path / "run" / "checkpoints")
     (tmp_path / "run" / "metrics.csv").write_text("frames,tra")
     with pytest.raises(FileNotFoundError, match="holds no checkpoint to resume from"):
