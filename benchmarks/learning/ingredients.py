@@ -1,8 +1,8 @@
 """Ingredients of off-policy learning, one at a time and together: what each does for DDPG, and TD3 and SAC beside it.
 
-HalfCheetah, raw torques, 150,000 steps; WAMGrasp, through an NHT of three dimensions, 200,000 steps; three seeds, which
-start alike in all variants. Writes rows, a table and a figure of final scores for each task, to
-``results/ingredients``.
+HalfCheetah, raw torques, 150,000 steps with minibatches of 128; WAMGrasp, through an NHT of three dimensions, 200,000
+steps; networks of 2 x 128; three seeds, which start alike in all variants. Writes rows, a table and a figure of final
+scores for each task, to ``results/ingredients``.
 
     python benchmarks/learning/ingredients.py FOLDER [TASK]
 """
@@ -51,6 +51,8 @@ TASKS = {
         [
             "env=half_cheetah",
             "map=none",
+            "algo.hidden=[128,128]",
+            "algo.batch_size=128",
             "algo.bfloat16=true",
             "algo.total_frames=150_000",
             "evaluation.every=10_000",
@@ -85,24 +87,25 @@ TASKS = {
 def variants(task: str) -> dict[str, tuple[str, list[str]]]:
     """The algorithm and settings of each variant, beside those that all have."""
     _, _, plain, others, noise = TASKS[task]
-    ahead, memory, updates = (3, 10, 200) if task == "half_cheetah" else (1, 1, 40)
+    ahead, memory, updates, rate = (3, 10, 200, 1e-3) if task == "half_cheetah" else (1, 1, 40, 3e-4)
+    rates = [f"algo.actor_learning_rate={rate}", f"algo.critic_learning_rate={rate}"]
+    distributed = ["algo.layer_norm=critic", "algo.quantiles=25"]
     added = {
         "DDPG": [],
         "observations as they are": ["algo.observation_norm=false"],
-        "the same, layer norm, critic": ["algo.observation_norm=false", "algo.layer_norm=critic"],
+        "as they are, layer norm, critic": ["algo.observation_norm=false", "algo.layer_norm=critic"],
         "layer norm, critic": ["algo.layer_norm=critic"],
         "layer norm, both": ["algo.layer_norm=all"],
         "25 quantiles": ["algo.quantiles=25"],
         "25 quantiles, 2 left out": ["algo.quantiles=25", "algo.dropped_quantiles=2"],
         "batches of 512": ["algo.batch_size=512"],
         "twice the updates": [f"algo.updates_per_batch={updates}"],
-        f"targets of {ahead} steps": [f"algo.n_steps={ahead}"],
-        f"noise with a memory of {memory}": [f"algo.noise_memory={memory}"],
-        "layer norm, 25 quantiles": [
-            "algo.layer_norm=critic",
-            "algo.quantiles=25",
-            "algo.dropped_quantiles=2",
-        ],
+        f"n-step targets, n = {ahead}": [f"algo.n_steps={ahead}"],
+        f"noise, memory {memory}": [f"algo.noise_memory={memory}"],
+        f"learning rates of {rate}": rates,
+        "layer norm, 25 quantiles": distributed,
+        f"the same, learning rates of {rate}": [*distributed, *rates],
+        f"the same, n = {ahead}": [*distributed, f"algo.n_steps={ahead}"],
     }
     beside = {
         "TD3: two critics, smoothed targets": ("td3", [*others, *noise]),
