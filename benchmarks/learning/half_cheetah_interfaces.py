@@ -7,7 +7,10 @@ PPO through raw torques, SVD's plane and NHT (k = 2), the latter two with and wi
 2. *Trials*: eight settings for each interface, two seeds each, 307,200 steps. Raw torques have one setting, the action
    scale; SVD two, all pairs of which are tried; NHT four of two levels each, of which every other combination is tried,
    so that each level is seen four times and what a pair of settings does together is not taken for what one does.
-3. Of every setting the level that did better in the mean is taken to 1,003,520 steps.
+   Of every setting the level that did better in the mean is kept.
+3. *A second round*, for maps: what happens at the motors' limits, with the scale (SVD) or the Lipschitz limit (NHT),
+   all pairs, from what the first round kept.
+4. What was kept is taken to 1,003,520 steps.
 
 Each stage trains the seeds and settings of an interface as one population. Writes trials, curves, a table and a figure
 to ``results/half_cheetah_interfaces``.
@@ -57,13 +60,18 @@ BASIS = {
     "lipschitz": (0.03, 0.1),
     "context": ("observation", "joint_angle"),
 }
-INTERFACES: dict[str, Mapping[str, tuple[Any, ...]]] = {
-    "raw": {"scale": (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0, 7.0)},
-    "svd": PLANE,
-    "svd, corrected": PLANE,
-    "nht": BASIS,
-    "nht, corrected": BASIS,
+LIMITS = {"saturation": ("scale", "clip")}
+PLANE_AGAIN = {"scale": (2.5, 3.5, 5.0)} | LIMITS
+BASIS_AGAIN = {"lipschitz": (0.03, 0.1, 0.3, "no limit")} | LIMITS
+Levels = Mapping[str, tuple[Any, ...]]
+INTERFACES: dict[str, tuple[Levels, ...]] = {
+    "raw": ({"scale": (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 5.0, 7.0)},),
+    "svd": (PLANE, PLANE_AGAIN),
+    "svd, corrected": (PLANE, PLANE_AGAIN),
+    "nht": (BASIS, BASIS_AGAIN),
+    "nht, corrected": (BASIS, BASIS_AGAIN),
 }
+"""Of each interface the rounds of its trials: settings, and their levels."""
 
 
 def main() -> None:
@@ -72,11 +80,13 @@ def main() -> None:
     record_ten_episodes(folder)
     trials, curves = [], []
     for interface in sys.argv[2:] or INTERFACES:
-        tried = try_out(interface, folder)
-        trials.append(tried)
-        best = chosen(tried, INTERFACES[interface])
-        print(interface, best, flush=True)
-        run = folder / "whole" / interface.replace(", ", "-")
+        best: dict[str, Any] = {}
+        for round, levels in enumerate(INTERFACES[interface], start=1):
+            tried = try_out(interface, levels, best, round, folder)
+            trials.append(tried)
+            best |= chosen(tried, levels)
+            print(interface, best, flush=True)
+        run = folder / "whole" / "-".join([interface.replace(", ", "-"), *map(str, best.values())])
         found = trained_runs(run, [*WHOLE, *told(interface, best, folder)], FRESH, "ppo")
         curves.append(found.assign(interface=interface))
         save(pandas.concat(trials, ignore_index=True), pandas.concat(curves, ignore_index=True))
@@ -103,9 +113,9 @@ def record_ten_episodes(folder: Path) -> None:
     nht.save_demos(torch.cat(parts), folder / "ten", env="half_cheetah")
 
 
-def try_out(interface: str, folder: Path) -> pandas.DataFrame:
-    """The trials of an interface: their settings, seed and return."""
-    settings, rows = half_of(INTERFACES[interface]), []
+def try_out(interface: str, levels: Levels, kept: Setting, round: int, folder: Path) -> pandas.DataFrame:
+    """The trials of a round, beside what earlier ones kept: settings, seed and return."""
+    settings, rows = [{**kept, **setting} for setting in half_of(levels)], []
     # Learners share every call, so maps of a population have contexts of one width.
     for context in dict.fromkeys(setting.get("context", "") for setting in settings):
         learners, tried = {}, []
@@ -113,16 +123,15 @@ def try_out(interface: str, folder: Path) -> pandas.DataFrame:
             if setting.get("context", "") == context:
                 name = "-".join([*(f"{name}={value}" for name, value in setting.items()), f"seed={seed}"])
                 learners[name] = [*TRIAL, *told(interface, setting, folder), f"seed={seed}"]
-                tried.append({"interface": interface, **setting, "seed": seed})
-        runs = trained_together(
-            folder / "trials" / f"{interface.replace(', ', '-')}-{context}", learners, "ppo"
-        )
+                tried.append({"interface": interface, "round": round, **setting, "seed": seed})
+        name = f"{interface.replace(', ', '-')}-{context}{'-again' * (round - 1)}"
+        runs = trained_together(folder / "trials" / name, learners, "ppo")
         for row, found in zip(tried, runs.values(), strict=True):
             rows.append(row | {tested(RETURN): float(found[tested(RETURN)].iloc[-1])})
     return pandas.DataFrame(rows)
 
 
-def half_of(levels: Mapping[str, tuple[Any, ...]]) -> list[Setting]:
+def half_of(levels: Levels) -> list[Setting]:
     """All combinations; of four settings every other one, those whose levels' places add up to an even number."""
     places = itertools.product(*(range(len(values)) for values in levels.values()))
     kept = [each for each in places if len(levels) < 4 or sum(each) % 2 == 0]
@@ -132,9 +141,13 @@ def half_of(levels: Mapping[str, tuple[Any, ...]]) -> list[Setting]:
     ]
 
 
-def chosen(trials: pandas.DataFrame, levels: Mapping[str, tuple[Any, ...]]) -> Setting:
+def chosen(trials: pandas.DataFrame, levels: Levels) -> Setting:
     """Of every setting the level with the higher mean return."""
-    return {name: trials.groupby(name)[tested(RETURN)].mean().idxmax() for name in levels}
+    best = {}
+    for name, values in levels.items():
+        means = [trials[[each == value for each in trials[name]]][tested(RETURN)].mean() for value in values]
+        best[name] = values[means.index(max(means))]
+    return best
 
 
 def told(interface: str, setting: Setting, folder: Path) -> list[str]:
@@ -146,10 +159,13 @@ def told(interface: str, setting: Setting, folder: Path) -> list[str]:
     demos = ONE_EPISODE if setting["episodes"] == "one" else folder / "ten"
     name, asked = f"{kind}-{setting['episodes']}", [f"map={kind}", f"demos.path={demos}"]
     if kind == "nht":
-        name += f"-{setting['lipschitz']}-{setting['context']}"
-        asked += [f"map.lipschitz={setting['lipschitz']}", f"env.context_keys=[{setting['context']}]"]
+        limit = "null" if setting["lipschitz"] == "no limit" else setting["lipschitz"]
+        name += f"-{limit}-{setting['context']}"
+        asked += [f"map.lipschitz={limit}", f"env.context_keys=[{setting['context']}]"]
     map = made(folder / f"{name}.safetensors", "train_map", ["env=half_cheetah", *asked, "map.action_dim=2"])
-    return [f"map={kind}", f"map.file={map}", scale, *(["map.residual=0.3"] if corrected else [])]
+    more = ["map.residual=0.3"] if corrected else []
+    more += [f"map.saturation={setting['saturation']}"] if "saturation" in setting else []
+    return [f"map={kind}", f"map.file={map}", scale, *more]
 
 
 def save(trials: pandas.DataFrame, curves: pandas.DataFrame) -> None:

@@ -42,6 +42,8 @@ def main() -> None:
     for name, (metric, title, lines) in CURVES.items():
         curves = pandas.read_csv(RESULTS / name / "curves.csv")
         plot(curves, metric, title, RESULTS / name / f"{metric}.png", lines)
+    first = RESULTS / "half_cheetah_interfaces" / "first_round.csv"
+    plot(pandas.read_csv(first), "return", "HalfCheetah, PPO", first.with_suffix(".png"))
     for name in ("search_wam_wipe", "search_wam_grasp", "search_wam_grasp_1m"):
         write_report(RESULTS / name / "rows.csv", RESULTS / name / "report", "")
     for table in sorted((RESULTS / "compare_maps").glob("*/table.csv")):
