@@ -143,11 +143,7 @@ def half_of(levels: Levels) -> list[Setting]:
 
 def chosen(trials: pandas.DataFrame, levels: Levels) -> Setting:
     """Of every setting the level with the higher mean return."""
-    best = {}
-    for name, values in levels.items():
-        means = [trials[[each == value for each in trials[name]]][tested(RETURN)].mean() for value in values]
-        best[name] = values[means.index(max(means))]
-    return best
+    return {name: trials.groupby(name, sort=False)[tested(RETURN)].mean().idxmax() for name in levels}
 
 
 def told(interface: str, setting: Setting, folder: Path) -> list[str]:
