@@ -7,7 +7,8 @@ PPO through raw torques, SVD's plane and NHT (k = 2), the latter two with and wi
 2. *Trials*: eight settings for each interface, two seeds each, 307,200 steps. Raw torques have one setting, the action
    scale; SVD two, all pairs of which are tried; NHT four of two levels each, of which every other combination is tried,
    so that each level is seen four times and what a pair of settings does together is not taken for what one does.
-   Of every setting the level that did better in the mean is kept.
+   Of each of NHT's four settings the level that did better in the mean is kept; otherwise, where all combinations were
+   tried, the best of them.
 3. *A second round*, for maps: what happens at the motors' limits, with the scale (SVD) or the Lipschitz limit (NHT),
    all pairs, from what the first round kept.
 4. What was kept is taken to 1,003,520 steps.
@@ -22,7 +23,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,9 @@ from nht.recipes.study.report import to_markdown
 from populations import made, trained_runs, trained_together
 
 RESULTS = Path(__file__).parents[1] / "results" / "half_cheetah_interfaces"
-ONE_EPISODE = Path(__file__).parents[1] / "demos" / "half_cheetah"
+DEMOS = Path(__file__).parents[1] / "demos"
+EPISODES = {"one": DEMOS / "half_cheetah", "sac": DEMOS / "half_cheetah_sac"}
+"""One episode of a policy that PPO learned, and of one that SAC learned; ``ten`` are recorded here."""
 EXPERT = {307_200: 3, 614_400: 3, 1_003_520: 4}
 """Steps of learning, and the number of episodes that are recorded after them."""
 
@@ -89,7 +92,7 @@ def main() -> None:
         run = folder / "whole" / "-".join([interface.replace(", ", "-"), *map(str, best.values())])
         found = trained_runs(run, [*WHOLE, *told(interface, best, folder)], FRESH, "ppo")
         curves.append(found.assign(interface=interface))
-        save(pandas.concat(trials, ignore_index=True), pandas.concat(curves, ignore_index=True))
+        save(trials, curves, RESULTS)
 
 
 def record_ten_episodes(folder: Path) -> None:
@@ -116,34 +119,48 @@ def record_ten_episodes(folder: Path) -> None:
 def try_out(interface: str, levels: Levels, kept: Setting, round: int, folder: Path) -> pandas.DataFrame:
     """The trials of a round, beside what earlier ones kept: settings, seed and return."""
     settings, rows = [{**kept, **setting} for setting in half_of(levels)], []
-    # Learners share every call, so maps of a population have contexts of one width.
-    for context in dict.fromkeys(setting.get("context", "") for setting in settings):
+    # Learners share every call, so maps of a population have contexts and actions of one width.
+    for width in dict.fromkeys(map(widths, settings)):
         learners, tried = {}, []
         for setting, seed in itertools.product(settings, TRIED):
-            if setting.get("context", "") == context:
+            if widths(setting) == width:
                 name = "-".join([*(f"{name}={value}" for name, value in setting.items()), f"seed={seed}"])
                 learners[name] = [*TRIAL, *told(interface, setting, folder), f"seed={seed}"]
                 tried.append({"interface": interface, "round": round, **setting, "seed": seed})
-        name = f"{interface.replace(', ', '-')}-{context}{'-again' * (round - 1)}"
+        name = f"{interface.replace(', ', '-')}-{width}{'-again' * (round - 1)}"
         runs = trained_together(folder / "trials" / name, learners, "ppo")
         for row, found in zip(tried, runs.values(), strict=True):
             rows.append(row | {tested(RETURN): float(found[tested(RETURN)].iloc[-1])})
     return pandas.DataFrame(rows)
 
 
+def widths(setting: Setting) -> str:
+    """What the widths of a map's context and action depend on."""
+    return f"{setting.get('context', '')}{setting.get('k', '')}"
+
+
 def half_of(levels: Levels) -> list[Setting]:
     """All combinations; of four settings every other one, those whose levels' places add up to an even number."""
     places = itertools.product(*(range(len(values)) for values in levels.values()))
-    kept = [each for each in places if len(levels) < 4 or sum(each) % 2 == 0]
+    kept = [each for each in places if not halved(levels) or sum(each) % 2 == 0]
     return [
         {name: values[place] for (name, values), place in zip(levels.items(), each, strict=True)}
         for each in kept
     ]
 
 
+def halved(levels: Levels) -> bool:
+    """Whether not all of the combinations are tried."""
+    return len(levels) == 4
+
+
 def chosen(trials: pandas.DataFrame, levels: Levels) -> Setting:
-    """Of every setting the level with the higher mean return."""
-    return {name: trials.groupby(name, sort=False)[tested(RETURN)].mean().idxmax() for name in levels}
+    """The combination with the highest mean return; of half of them, of every setting the level."""
+    names = list(levels)
+    if halved(levels):
+        return {name: trials.groupby(name, sort=False)[tested(RETURN)].mean().idxmax() for name in names}
+    best = trials.groupby(names, sort=False)[tested(RETURN)].mean().reset_index()
+    return dict(best.loc[best[tested(RETURN)].idxmax(), names])
 
 
 def told(interface: str, setting: Setting, folder: Path) -> list[str]:
@@ -152,27 +169,30 @@ def told(interface: str, setting: Setting, folder: Path) -> list[str]:
     kind, _, corrected = interface.partition(", ")
     if kind == "raw":
         return ["map=none", scale]
-    demos = ONE_EPISODE if setting["episodes"] == "one" else folder / "ten"
-    name, asked = f"{kind}-{setting['episodes']}", [f"map={kind}", f"demos.path={demos}"]
+    k, shown = setting.get("k", 2), setting["episodes"]
+    name = f"{kind}-{shown}{f'-{k}' if k != 2 else ''}"
+    asked = [f"map={kind}", f"map.action_dim={k}", f"demos.path={EPISODES.get(shown, folder / shown)}"]
     if kind == "nht":
         limit = "null" if setting["lipschitz"] == "no limit" else setting["lipschitz"]
         name += f"-{limit}-{setting['context']}"
         asked += [f"map.lipschitz={limit}", f"env.context_keys=[{setting['context']}]"]
-    map = made(folder / f"{name}.safetensors", "train_map", ["env=half_cheetah", *asked, "map.action_dim=2"])
+    map = made(folder / f"{name}.safetensors", "train_map", ["env=half_cheetah", *asked])
     more = ["map.residual=0.3"] if corrected else []
     more += [f"map.saturation={setting['saturation']}"] if "saturation" in setting else []
     return [f"map={kind}", f"map.file={map}", scale, *more]
 
 
-def save(trials: pandas.DataFrame, curves: pandas.DataFrame) -> None:
+def save(trials: Sequence[pandas.DataFrame], parts: Sequence[pandas.DataFrame], out: Path) -> None:
     """Write rows, table and figure."""
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    trials.to_csv(RESULTS / "trials.csv", index=False)
+    out.mkdir(parents=True, exist_ok=True)
+    if trials:
+        pandas.concat(trials, ignore_index=True).to_csv(out / "trials.csv", index=False)
+    curves = pandas.concat(parts, ignore_index=True)
     columns = ["task", "interface", "seed", FRAMES, tested(RETURN), SECONDS]
-    curves[columns].to_csv(RESULTS / "curves.csv", index=False)
+    curves[columns].to_csv(out / "curves.csv", index=False)
     table = summarise(curves, RETURN)
-    (RESULTS / "table.md").write_text(to_markdown(table))
-    plot(curves, RETURN, "HalfCheetah, PPO", RESULTS / "return.png")
+    (out / "table.md").write_text(to_markdown(table))
+    plot(curves, RETURN, "HalfCheetah, PPO", out / "return.png")
     print(table.to_string(index=False), flush=True)
 
 
