@@ -23,6 +23,7 @@ CURVES = {
     "wam_grasp": ("success", "WAMGrasp, DDPG, k = 3", "interface"),
     "half_cheetah": ("return", "HalfCheetah, PPO", "interface"),
     "half_cheetah_interfaces": ("return", "HalfCheetah, PPO", "interface"),
+    "half_cheetah_teachers": ("return", "HalfCheetah, PPO", "interface"),
     "half_cheetah_off_policy": ("return", "HalfCheetah, raw torques", "algorithm"),
 }
 """Of each folder with ``curves.csv``: what its figure shows, its title, and what its lines are."""
