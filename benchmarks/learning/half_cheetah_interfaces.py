@@ -192,8 +192,14 @@ def save(trials: Sequence[pandas.DataFrame], parts: Sequence[pandas.DataFrame], 
     curves[columns].to_csv(out / "curves.csv", index=False)
     table = summarise(curves, RETURN)
     (out / "table.md").write_text(to_markdown(table))
-    plot(curves, RETURN, "HalfCheetah, PPO", out / "return.png")
+    draw(curves, out)
     print(table.to_string(index=False), flush=True)
+
+
+def draw(curves: pandas.DataFrame, out: Path) -> None:
+    """The figure of ``out``; what is corrected, which does not pay, is in the table only."""
+    shown = curves[~curves["interface"].str.endswith("corrected")]
+    plot(shown, RETURN, "HalfCheetah, PPO", out / "return.png")
 
 
 if __name__ == "__main__":

@@ -22,8 +22,6 @@ CURVES = {
     "wam_wipe": ("success", "WAMWipe, DDPG, start fixed", "interface"),
     "wam_grasp": ("success", "WAMGrasp, DDPG, k = 3", "interface"),
     "half_cheetah": ("return", "HalfCheetah, PPO", "interface"),
-    "half_cheetah_interfaces": ("return", "HalfCheetah, PPO", "interface"),
-    "half_cheetah_teachers": ("return", "HalfCheetah, PPO", "interface"),
     "half_cheetah_off_policy": ("return", "HalfCheetah, raw torques", "algorithm"),
 }
 """Of each folder with ``curves.csv``: what its figure shows, its title, and what its lines are."""
@@ -35,6 +33,7 @@ def main() -> None:
     import batch_scaling
     import demos_in_replay
     import grasp_ceiling
+    import half_cheetah_interfaces
     import half_cheetah_planes
     import hard_corner
     import imitation
@@ -45,6 +44,8 @@ def main() -> None:
     for name, (metric, title, lines) in CURVES.items():
         curves = pandas.read_csv(RESULTS / name / "curves.csv")
         plot(curves, metric, title, RESULTS / name / f"{metric}.png", lines)
+    for name in ("half_cheetah_interfaces", "half_cheetah_teachers"):
+        half_cheetah_interfaces.draw(pandas.read_csv(RESULTS / name / "curves.csv"), RESULTS / name)
     half_cheetah_planes.draw(pandas.read_csv(half_cheetah_planes.RESULTS / "planes.csv"))
     for name in ("search_wam_wipe", "search_wam_grasp", "search_wam_grasp_1m"):
         write_report(RESULTS / name / "rows.csv", RESULTS / name / "report", "")
