@@ -185,8 +185,7 @@ def told(interface: str, setting: Setting, folder: Path) -> list[str]:
 def save(trials: Sequence[pandas.DataFrame], parts: Sequence[pandas.DataFrame], out: Path) -> None:
     """Write rows, table and figure."""
     out.mkdir(parents=True, exist_ok=True)
-    if trials:
-        pandas.concat(trials, ignore_index=True).to_csv(out / "trials.csv", index=False)
+    pandas.concat(trials, ignore_index=True).to_csv(out / "trials.csv", index=False)
     curves = pandas.concat(parts, ignore_index=True)
     columns = ["task", "interface", "seed", FRAMES, tested(RETURN), SECONDS]
     curves[columns].to_csv(out / "curves.csv", index=False)
